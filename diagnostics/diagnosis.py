@@ -55,6 +55,7 @@ from diagnostics.preprocessing.load import LoadDirection
 from diagnostics.preprocessing.readings import RecordingBlocks
 from diagnostics.sensor.rewiring import Rewiring, find_rewiring
 from diagnostics.sensor.shared import Shared, measured
+from diagnostics.sensor.swapped_in_part import SwappedInPart, find_swapped_in_part
 from diagnostics.threads import one_thread
 
 SCHEMA = "adaptfault.diagnoser/1"
@@ -319,17 +320,37 @@ class SelfDiagnosis:
         Raises:
             ValueError: recordings that do not fit the layout, or hold no frame.
         """
+        log = self._for_wiring(recordings)
+        if log is None or self.reference_ is None:
+            return None
+        with one_thread():
+            return find_rewiring(log, self.reference_, self.layout)
+
+    def swapped_in_part(self, recordings: ArrayLike | Sequence[ArrayLike]) -> SwappedInPart | None:
+        """Return the rows, columns or pads that answer in each other's place in some of the
+        recordings, None where the data show none.
+
+        ``SwappedInPart.undo`` puts these recordings back. Limits and errors as for
+        :meth:`rewiring`.
+        """
+        log = self._for_wiring(recordings)
+        if log is None or self.reference_ is None:
+            return None
+        with one_thread():
+            return find_swapped_in_part(log, self.reference_, self.layout)
+
+    def _for_wiring(self, recordings: ArrayLike | Sequence[ArrayLike]) -> RecordingBlocks | None:
+        """Return a log as loads; None where its wiring cannot be compared with a reference."""
         log = checked_recordings(recordings, self.layout).valid(
             self.layout.full_scale, self.layout.present.ravel()
         )
         if self.reference_ is None or self.layout.axes > 1:
             return None
-        if self.load_ is not None:
-            if self.load_.direction == "middle":
-                return None
-            log = RecordingBlocks([self.load_.loads(recording) for recording in log])
-        with one_thread():
-            return find_rewiring(log, self.reference_, self.layout)
+        if self.load_ is None:
+            return log
+        if self.load_.direction == "middle":
+            return None
+        return RecordingBlocks([self.load_.loads(recording) for recording in log])
 
     def state(self) -> tuple[dict[str, Any], Arrays]:
         """Return the fitted state: a JSON-safe dict and arrays by name, as :meth:`from_state` reads

@@ -1,4 +1,4 @@
-"""Changed readings: exchanged wires and replaced pads of a log, and the log with both undone."""
+"""Changed readings: exchanged wires and replaced pads of a log, and the log with them undone."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from diagnostics import Diagnosis, FaultKind, FaultSet, SelfDiagnosis
 from diagnostics.sensor.recalibration import Recalibration, find_recalibration, recalibrated
 from diagnostics.sensor.rewiring import Rewiring
 from diagnostics.sensor.sensor_change import SensorChange, find_change
+from diagnostics.sensor.swapped_in_part import SwappedInPart
 
 if TYPE_CHECKING:
     from adaptfault.bundle.versions import Version
@@ -31,6 +32,7 @@ class ChangedReadings:
         diagnosis: of these.
         as_found: the recordings as they came and their diagnosis, where a pad was replaced; None
             otherwise.
+        in_part: wires that were exchanged in some of the recordings: no version undoes that.
     """
 
     rewiring: Rewiring | None
@@ -38,6 +40,7 @@ class ChangedReadings:
     frames: Frames
     diagnosis: Diagnosis
     as_found: ChangedReadings | None = None
+    in_part: SwappedInPart | None = None
 
     @property
     def reason(self) -> str:
@@ -102,13 +105,9 @@ def find_changed_readings(
             replaced, and wires as exchanged only where fewer cells are faulty once they are put
             back.
     """
-    exchanged = None
-    rewiring = diagnoser.rewiring(frames)
-    if rewiring is not None:
-        put_back = [rewiring.undo(recording) for recording in frames]
-        exchanged = ChangedReadings(rewiring, None, put_back, diagnoser.diagnose(put_back))
-        if not disturbed:
-            return exchanged
+    exchanged = _put_back(diagnoser, frames)
+    if exchanged is not None and not disturbed:
+        return exchanged
     as_found = ChangedReadings(None, None, frames, diagnoser.diagnose(frames))
     if disturbed:
         if exchanged is not None and exchanged.diagnosis.n_lost < as_found.diagnosis.n_lost:
@@ -119,6 +118,20 @@ def find_changed_readings(
         return as_found
     undone = [recalibration.undo(recording, diagnoser.layout.full_scale) for recording in frames]
     return ChangedReadings(None, recalibration, undone, diagnoser.diagnose(undone), as_found)
+
+
+def _put_back(diagnoser: SelfDiagnosis, frames: Frames) -> ChangedReadings | None:
+    """Return a log with exchanged wires put back, in the recordings in which they are; None where
+    none are."""
+    in_part = diagnoser.swapped_in_part(frames)
+    if in_part is not None:
+        put_back = in_part.undo(frames)
+        return ChangedReadings(None, None, put_back, diagnoser.diagnose(put_back), in_part=in_part)
+    rewiring = diagnoser.rewiring(frames)
+    if rewiring is None:
+        return None
+    put_back = [rewiring.undo(recording) for recording in frames]
+    return ChangedReadings(rewiring, None, put_back, diagnoser.diagnose(put_back))
 
 
 def find_sensor_change(

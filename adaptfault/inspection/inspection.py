@@ -273,6 +273,8 @@ def _change(
 
 def _of_readings(readings: ChangedReadings) -> list[Finding]:
     """Return exchanged wires, or replaced pads."""
+    if readings.in_part is not None:
+        return [_told("swapped_in_part", readings.in_part.reason)]
     if readings.rewiring is not None:
         return [_told("rewired", readings.reason)]
     if readings.recalibration is not None:

@@ -9,14 +9,14 @@ its frames reach. Where enough cells jump, the frame is one of three:
   1904), or nearly every cell reads one and the same number that it does
   not read otherwise, or most cells read far above everything else in the log. Bytes were exchanged,
   lost, or replaced on the way.
-- a **spike**: nearly every cell jumps by the same amount. Supply, bus, or a discharge.
+- a **spike**: three quarters of the cells jump by the same amount. Supply, bus, or a discharge.
 - an **impact**: everything else. It stays.
 
 Neighbours are those of the grid, or the cell that follows each cell best in the log: which of both
 tells more of the loads of usual frames. A frame that is left out is replaced by the one before it.
 
 Not detected: an odd frame in which few cells jump, more than one in three successive frames, and
-corruption of fewer than twelve cells that no neighbour is known of.
+corruption of fewer than sixteen cells that no neighbour is known of.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from diagnostics.preprocessing.quantiles import known_quantile
 _NEAR = 3  # frames before and after, of which the medians are taken
 _USUAL = 4.0  # times the jumps that a tenth of the frames reach
 _FEWEST = 4  # jumping cells; fewer blink
-_ENOUGH = 12  # jumping cells, whose agreement with their neighbours can be measured
+_ENOUGH = 16  # jumping cells, whose agreement with their neighbours can be measured
 _AGREES = 0.25  # of the median jump, by which a cell may jump otherwise in a spike
 _BEYOND = 1.5  # times the highest reading of usual frames
 _SAMPLE = 64  # usual frames, whose loads are compared with their neighbours: a size
@@ -315,7 +315,7 @@ class _Test:
             return "corrupt"
         typical = float(np.median(jumps[read]))
         alike = np.abs(jumps[read] - typical) <= _AGREES * abs(typical)
-        if count >= MAJORITY * read.sum() and alike.mean() >= 1 - 2 * LOW:
+        if count >= MAJORITY * read.sum() and alike.mean() >= 1 - LEAST_LOADED:
             return "spike"
         if (frame[read] > _BEYOND * self._highest).mean() > MAJORITY:
             return "corrupt"

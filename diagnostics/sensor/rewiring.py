@@ -60,7 +60,7 @@ _FEWEST = 4  # events; fewer prove nothing
 _LINES = 16
 _FEW_LINES = 4
 _WORK = 6400  # lines times cells, about: a size
-_LIMIT = 2 * CERTAIN_RATIO  # log likelihood gained, all events together
+LIMIT = 2 * CERTAIN_RATIO  # log likelihood gained, all events together
 _WITHOUT = 2  # events without which there must be a gain too: one odd contact proves nothing
 # of what a random order of a pad loses: gained where a whole pad is turned; by chance up to 0.03
 _TURNED = 0.05
@@ -130,7 +130,7 @@ def find_rewiring(
     recordings = levelled(
         recordings, levels_above(recordings, reference.scale, present, reference.offset)
     )
-    events, weight = _events(recordings, reference.scale)
+    events, weight = events_of(recordings, reference.scale)
     if len(events) < _FEWEST:
         return None
     # Constant cells may be broken, those that are never at rest loaded by a strap: neither scored
@@ -141,7 +141,7 @@ def find_rewiring(
         axis=0,
     )
     used = moved & rested
-    test = _Test(events, weight, reference.model, reference.scale, present, used)
+    test = Test(events, weight, reference.model, reference.scale, present, used)
     source = np.arange(layout.n_cells)
     anywhere = np.random.default_rng(0).permutation(layout.n_cells)
 
@@ -152,7 +152,7 @@ def find_rewiring(
     steps: list[str] = []
     now = test.settled(source, test.score(source, ~used))
     for _ in range(_MOST_STEPS):
-        candidates = list(_candidates(layout, now.surplus, source))
+        candidates = list(candidates_of(layout, now.surplus, source))
         if not candidates:  # one pad without rows and columns
             break
         scores = [
@@ -176,7 +176,7 @@ def find_rewiring(
             for i, of in enumerate(candidates)
             if i != best and (moves & (of.source != source)).any()
         ]
-        if not _certain(gain) or sums[best] - max(rivals, default=-np.inf) < _LIMIT / 2:
+        if not _certain(gain) or sums[best] - max(rivals, default=-np.inf) < LIMIT / 2:
             break
         if (
             candidates[best].turned
@@ -205,7 +205,7 @@ def find_rewiring(
 def _certain(gain: Floats) -> bool:
     """Return whether the gains of the events, ``[n]``, prove a permutation, even without the two
     largest."""
-    return bool(gain.sum() >= _LIMIT and np.sort(gain)[:-_WITHOUT].sum() > 0)
+    return bool(gain.sum() >= LIMIT and np.sort(gain)[:-_WITHOUT].sum() > 0)
 
 
 class _Score(NamedTuple):
@@ -225,7 +225,7 @@ class _Score(NamedTuple):
 
 
 @dataclass(frozen=True)
-class _Test:
+class Test:
     """Scores permutations on the same events.
 
     Attributes:
@@ -379,9 +379,11 @@ def _log_load(features: NDArray[np.float32], mean: Floats, spread: Floats) -> Fl
     return np.where(features[:, 2] > 0, np.log(contaminated), 0.0)
 
 
-def _events(recordings: Sequence[NDArray[np.float64]], scale: Scale) -> tuple[list[Floats], Floats]:
-    """Return frames ``[t, D]`` of each of the strongest contact events of the log, and the weights
-    ``[n]``."""
+def events_of(
+    recordings: Sequence[NDArray[np.float64]], scale: Scale, *, most: int = _EVENTS
+) -> tuple[list[Floats], Floats]:
+    """Return frames ``[t, D]`` of each of the ``most`` strongest contact events of the log, and the
+    weights ``[n]``."""
     events = []
     found = []
     for recording in recordings:
@@ -394,13 +396,13 @@ def _events(recordings: Sequence[NDArray[np.float64]], scale: Scale) -> tuple[li
     amplitudes = [event.amplitude(np.ones(len(event.lowest), np.float32)) for event in events]
     # In time order, and no more: the repeats of a whole log would be counted in a square of its
     # events.
-    strongest = np.sort(np.argsort(np.negative(amplitudes), kind="stable")[:_EVENTS]).tolist()
+    strongest = np.sort(np.argsort(np.negative(amplitudes), kind="stable")[:most]).tolist()
     return [found[i] for i in strongest], 1 / (
         1 + count_repeats([events[i] for i in strongest], THE_SAME)
     )
 
 
-def _candidates(layout: SensorLayout, surplus: Floats, source: Cells) -> Iterator[_Candidate]:
+def candidates_of(layout: SensorLayout, surplus: Floats, source: Cells) -> Iterator[_Candidate]:
     """Yield the permutations that are tried, each on top of ``source``; with declared wiring only
     exchanged pads."""
     grid, score = layout.grid(np.arange(layout.n_cells)), layout.grid(surplus)

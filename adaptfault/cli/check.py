@@ -133,4 +133,4 @@ def _write(
         from adaptfault.data.recordings.valid import valid_masks, write_valid
 
         masks = valid_masks(iter(log), diagnosis.faults, log.layout)
-        write_valid(args.write_valid, masks, log.names, log.layout)
+        write_valid(args.write_valid, masks, log.names, log.layout, log.origins)

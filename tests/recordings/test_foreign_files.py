@@ -315,14 +315,6 @@ def lerobot_pipe(path):
     os.mkfifo(path / "data/file.parquet")
 
 
-def parquet_declares(path):
-    zeros = pa.array(np.zeros(12 * 500_000, np.int8))
-    part = pa.table({"tactile": pa.FixedSizeListArray.from_arrays(zeros, 12)})
-    with pq.ParquetWriter(path, part.schema, compression="zstd") as writer:
-        for _ in range(100):
-            writer.write_table(part)
-
-
 HOSTILE = {
     "never_written.h5": (lambda p: h5_declares(p, shape=(10**9, 12), chunks=(99, 12)), "declares"),
     "contiguous.h5": (lambda p: h5_declares(p, shape=(10**9, 12)), "declares"),
@@ -332,7 +324,6 @@ HOSTILE = {
     "pipe.zarr": (lambda p: zarr_with(p, pipe), "cannot be read"),
     "device.zarr": (lambda p: zarr_with(p, device), "cannot be read"),
     "lerobot": (lerobot_pipe, "not a regular file"),
-    "rows.parquet": (parquet_declares, "declares 600,000,000 bytes"),
 }
 
 
@@ -353,6 +344,17 @@ def test_a_mat_file_that_unpacks_to_more_than_the_limit_is_refused(tmp_path, mon
     scipy.io.savemat(tmp_path / "a.mat", {"tactile": np.zeros((10**5, 12))}, do_compression=True)
     monkeypatch.setattr(mat, "MOST_BYTES", 10**6)
     assert "unpacks to more than 1,000,000 bytes" in refusal(tmp_path / "a.mat", layout=GRID)
+
+
+def test_rows_of_parquet_that_are_all_alike_are_limited(tmp_path, monkeypatch):
+    from adaptfault.data.recordings.facts import declared
+
+    monkeypatch.setattr(declared, "_FREE", 10**5)
+    monkeypatch.setattr(declared, "_RATIO", 20)
+    table(tmp_path / "a.parquet", tactile=lists(np.zeros((60_000, 12), np.float32)))
+    table(tmp_path / "good.parquet", tactile=lists(X))
+    loaded = check(tmp_path)
+    assert "a.parquet: tactile declares 2,880,000 bytes" in messages(loaded, "error")[0]
 
 
 def test_links_in_circles_and_deep_groups_end(tmp_path):

@@ -41,7 +41,7 @@ from adaptfault.data.recordings.facts.resolve import (
 from adaptfault.data.recordings.facts.targets import TargetTable, target_files
 from adaptfault.data.recordings.files import Found, find
 from adaptfault.data.recordings.readers import check_stated, readers
-from adaptfault.data.recordings.recording import BLOCK
+from adaptfault.data.recordings.recording import BLOCK, Recording
 from adaptfault.data.recordings.survey import Content, Surveyor
 from diagnostics import SensorLayout
 
@@ -126,6 +126,11 @@ class Opened:
         self._usable = usable
         self._tables = tables
         self.late_problems: tuple[Problem, ...] = ()
+
+    @property
+    def origins(self) -> tuple[Recording, ...]:
+        """The recordings as their readers give them: which arrays of a data set hold them."""
+        return tuple(content.recordings[i] for _, content, kept in self._usable for i in kept)
 
     @property
     def clock(self) -> Clock:

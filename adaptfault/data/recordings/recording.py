@@ -99,6 +99,7 @@ class Recording:
         label: its class.
         arrays: of the file that hold its readings.
         number: how the file numbers it; None: it does not.
+        row: how a table numbers its first row; None: the file is no table.
     """
 
     facts: Facts
@@ -107,6 +108,7 @@ class Recording:
     label: str | None = None
     arrays: tuple[str, ...] = ()
     number: int | None = None
+    row: int | None = None
 
     @property
     def frames(self) -> NDArray[Any]:

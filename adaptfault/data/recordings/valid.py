@@ -4,15 +4,20 @@ A reading is valid where its cell exists, is not in F (from the onset of its fau
 missing. No published contract of data sets has such a field; the names here are
 
 - NPZ: ``valid`` bool ``[n, T, pads, rows, cols]``, ``lengths``, ``names``
-- Parquet: ``episode_index``, ``frame_index``, and a column ``observation.tactile.<pad>.valid`` of
-  lists for each pad, in the order of the rows of a LeRobot data set
-- Zarr: ``data/valid`` ``[N, pads, rows, cols]``, ``meta/episode_ends``
-- HDF5: ``episode_<i>/valid`` ``[T, pads, rows, cols]``
+- Parquet: ``episode_index``, ``frame_index`` and ``index`` as in the data set, and
+  ``<feature>.valid``
+- Zarr: ``<array>.valid`` ``[N, ...]`` and ``meta/episode_ends``; of groups as in HDF5
+- HDF5: ``<array>.valid`` in the groups of the data set (``data/demo_7/obs/tactile.valid``), or in
+  ``episode_<i>`` where it has none
+
+Each mask has the shape of the frames of its feature. A data set without names of features, as CSV,
+gets ``observation.tactile.<pad>.valid``, ``data/valid`` or ``valid``, ``[..., pads, rows, cols]``.
 """
 
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from os import PathLike
 from pathlib import Path
@@ -24,6 +29,8 @@ from numpy.typing import NDArray
 from adaptfault.data.atomic import atomic_file, atomic_folder
 from adaptfault.data.recordings.errors import InputError
 from adaptfault.data.recordings.formats.datasets.extra import imported
+from adaptfault.data.recordings.formats.datasets.features import by_episode
+from adaptfault.data.recordings.recording import Recording
 from diagnostics import Fault, SensorLayout
 
 _SCHEMA = "adaptfault.valid/1"
@@ -49,7 +56,11 @@ def valid_masks(
 
 
 def write_valid(
-    path: str | PathLike[str], masks: Masks, names: Sequence[str], layout: SensorLayout
+    path: str | PathLike[str],
+    masks: Masks,
+    names: Sequence[str],
+    layout: SensorLayout,
+    origins: Sequence[Recording] = (),
 ) -> None:
     """Write masks into a file of the format that its name ends in.
 
@@ -58,6 +69,7 @@ def write_valid(
         masks: bool ``[T, D]`` of each recording.
         names: of the recordings.
         layout: the array.
+        origins: the recordings as they were read, whose arrays give the masks their names.
 
     Raises:
         InputError: another ending, the package of the format is not installed, or the path is a
@@ -70,7 +82,7 @@ def write_valid(
         what = f"expected a name that ends in {', '.join(_WRITERS)}"
         raise InputError.at(path, what)
     refuse_foreign(path)
-    writer(path, masks, names, layout)
+    writer(path, masks, names, _Places(origins, layout))
 
 
 def refuse_foreign(path: str | PathLike[str]) -> None:
@@ -90,69 +102,166 @@ def _is_ours(path: Path) -> bool:
     try:
         about = json.loads((path / ".zattrs").read_bytes())
         names = {entry.name for entry in path.iterdir()}
-    except (OSError, ValueError, RecursionError):
+        held = set(about.get("holds", ())) | _IN_STORE
+    except (OSError, ValueError, RecursionError, AttributeError, TypeError):
         return False
-    ours = isinstance(about, dict) and about.get("schema") == _SCHEMA
-    return ours and names <= _IN_STORE
+    return about.get("schema") == _SCHEMA and names <= held
 
 
-def _npz(path: Path, masks: Masks, names: Sequence[str], layout: SensorLayout) -> None:
+class _Places:
+    """How the masks of recordings are called: as the arrays that hold the readings, where these
+    have names.
+
+    Args:
+        origins: the recordings as they were read; () = nothing has names.
+        layout: the array.
+
+    Attributes:
+        arrays: names of the arrays of each recording; empty where one has none.
+        features: the names that all recordings have in common, without those of episodes; empty
+            where there are none.
+        are_own: whether each recording has arrays of its own.
+    """
+
+    def __init__(self, origins: Sequence[Recording], layout: SensorLayout) -> None:
+        self.layout = layout
+        self._origins = origins
+        named = bool(origins) and all(one.arrays for one in origins)
+        self.arrays = [one.arrays for one in origins] if named else []
+        every = [name for names in self.arrays for name in names]
+        self.are_own = named and len(set(every)) == len(every)
+        common = {tuple(_without_episode(name) for name in names) for names in self.arrays}
+        self.features = common.pop() if len(common) == 1 else ()
+        numbers = [one.number for one in origins]
+        are_numbered = None not in numbers and len(set(numbers)) == len(numbers)
+        self._numbers = numbers if are_numbered else []
+
+    def number(self, i: int) -> int:
+        """Return the number of a recording in its data set, else its place."""
+        number = self._numbers[i] if self._numbers else None
+        return i if number is None else number
+
+    def rows(self, i: int, before: int) -> int:
+        """Return how a table numbers the first row of a recording; ``before``: rows of those before
+        it."""
+        row = self._origins[i].row if self._numbers else None
+        return before if row is None else row
+
+    def parts(self, i: int, mask: NDArray[np.bool_]) -> list[NDArray[np.bool_]]:
+        """Return the mask ``[T, D]`` of a recording as one ``[T, ...]`` for each of its arrays."""
+        facts = self._origins[i].facts
+        stored = mask if facts.places is None else mask[:, facts.places]
+        ends = np.cumsum([math.prod(sizes) for sizes in facts.sizes])[:-1]
+        parts = np.split(stored, ends, axis=1)
+        return [
+            part.reshape(len(mask), *sizes) for part, sizes in zip(parts, facts.sizes, strict=True)
+        ]
+
+    def grid(self, mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Return a mask as ``[T, pads, rows, cols]``."""
+        return mask.reshape(-1, *self.layout.shape)
+
+
+def _without_episode(name: str) -> str:
+    ((common, _),) = by_episode([name]).popitem()[1].items()
+    return common
+
+
+def _npz(path: Path, masks: Masks, names: Sequence[str], places: _Places) -> None:
     every = list(masks)
     lengths = np.array([len(mask) for mask in every])
-    padded = np.zeros((len(every), int(lengths.max()), layout.n_cells), dtype=bool)
+    padded = np.zeros((len(every), int(lengths.max()), places.layout.n_cells), dtype=bool)
     for i, mask in enumerate(every):
         padded[i, : len(mask)] = mask
     with atomic_file(path) as name, name.open("wb") as file:
         np.savez_compressed(
             file,
-            valid=padded.reshape(*padded.shape[:2], *layout.shape),
+            valid=padded.reshape(*padded.shape[:2], *places.layout.shape),
             lengths=lengths,
             names=np.array(names, dtype=np.str_),
         )
 
 
-def _parquet(path: Path, masks: Masks, names: Sequence[str], layout: SensorLayout) -> None:
+def _parquet(path: Path, masks: Masks, names: Sequence[str], places: _Places) -> None:
     pa = imported("pyarrow", path)
     parquet = imported("pyarrow.parquet", path)
-    cells = layout.n_cells // layout.pads
-    kinds = pa.list_(pa.bool_(), cells)
-    pads = [f"observation.tactile.{pad}.valid" for pad in range(layout.pads)]
-    schema = pa.schema(
-        [("episode_index", pa.int64()), ("frame_index", pa.int64())]
-        + [(name, kinds) for name in pads]
-    )
-    with atomic_file(path) as place, parquet.ParquetWriter(place, schema) as writer:
-        for episode, mask in enumerate(masks):
-            by_pad = np.split(mask, layout.pads, axis=1)
-            columns = [pa.array(np.full(len(mask), episode)), pa.array(np.arange(len(mask)))]
-            columns += [
-                pa.FixedSizeListArray.from_arrays(pa.array(part.ravel()), cells) for part in by_pad
-            ]
-            writer.write_table(pa.table(columns, schema=schema))
+    features = places.features or [f"observation.tactile.{p}" for p in range(places.layout.pads)]
+    writer = None
+    before = 0
+    with atomic_file(path) as place:
+        for i, mask in enumerate(masks):
+            parts = np.split(mask, places.layout.pads, axis=1)
+            if places.features:
+                parts = places.parts(i, mask)
+            frames = np.arange(len(mask))
+            columns = {
+                "episode_index": pa.array(np.full(len(mask), places.number(i))),
+                "frame_index": pa.array(frames),
+                "index": pa.array(frames + places.rows(i, before)),
+            }
+            for name, part in zip(features, parts, strict=True):
+                columns[f"{name}.valid"] = _lists(pa, part)
+            table = pa.table(columns)
+            writer = writer or parquet.ParquetWriter(place, table.schema)
+            writer.write_table(table)
+            before += len(mask)
+        if writer is not None:
+            writer.close()
 
 
-def _zarr(path: Path, masks: Masks, names: Sequence[str], layout: SensorLayout) -> None:
+def _lists(pa: Any, mask: NDArray[np.bool_]) -> Any:
+    """Return a mask ``[T, ...]`` as a column of lists."""
+    column = pa.array(mask.ravel())
+    sizes = mask.shape[1:]
+    for size in reversed(sizes if sizes != (1,) else ()):
+        column = pa.FixedSizeListArray.from_arrays(column, size)
+    return column
+
+
+def _zarr(path: Path, masks: Masks, names: Sequence[str], places: _Places) -> None:
     zarr = imported("zarr", path)
-    every = list(masks)
-    joined = np.concatenate(every).reshape(-1, *layout.shape)
-    ends = np.cumsum([len(mask) for mask in every])
+    arrays: dict[str, NDArray[Any]] = {}
+    are_joined = len(set(places.arrays)) == 1
+    if places.are_own and not are_joined:
+        for i, mask in enumerate(masks):
+            for name, part in zip(places.arrays[i], places.parts(i, mask), strict=True):
+                arrays[f"{name}.valid"] = part
+    else:
+        every = list(masks)
+        arrays["meta/episode_ends"] = np.cumsum([len(mask) for mask in every])
+        if are_joined:
+            by_array = zip(*(places.parts(i, mask) for i, mask in enumerate(every)), strict=True)
+            for name, parts in zip(places.arrays[0], by_array, strict=True):
+                arrays[f"{name}.valid"] = np.concatenate(parts)
+        else:
+            arrays["data/valid"] = places.grid(np.concatenate(every))
     with atomic_folder(path, replaces=_is_ours(path)) as place:
         root = zarr.open_group(place, mode="w", zarr_format=2)
         root.attrs["schema"] = _SCHEMA
-        root.create_group("data").create_array("valid", data=joined)
-        root.create_group("meta").create_array("episode_ends", data=ends)
+        root.attrs["holds"] = sorted({name.partition("/")[0] for name in arrays})
+        for name, values in arrays.items():
+            root.create_array(name, data=values)
 
 
-def _hdf5(path: Path, masks: Masks, names: Sequence[str], layout: SensorLayout) -> None:
+def _hdf5(path: Path, masks: Masks, names: Sequence[str], places: _Places) -> None:
     h5py = imported("h5py", path)
     with atomic_file(path) as place, h5py.File(place, "w") as file:
-        for episode, (mask, name) in enumerate(zip(masks, names, strict=True)):
-            group = file.create_group(f"episode_{episode}")
+        for i, (mask, name) in enumerate(zip(masks, names, strict=True)):
+            if places.are_own:
+                for array, part in zip(places.arrays[i], places.parts(i, mask), strict=True):
+                    held = file.create_dataset(f"{array}.valid", data=part, compression="gzip")
+                    held.parent.attrs["name"] = name
+                continue
+            group = file.create_group(f"episode_{places.number(i)}")
             group.attrs["name"] = name
-            group.create_dataset("valid", data=mask.reshape(-1, *layout.shape), compression="gzip")
+            if not places.arrays:
+                group.create_dataset("valid", data=places.grid(mask), compression="gzip")
+                continue
+            for array, part in zip(places.arrays[i], places.parts(i, mask), strict=True):
+                group.create_dataset(f"{array}.valid", data=part, compression="gzip")
 
 
-_WRITERS: Mapping[str, Callable[[Path, Masks, Sequence[str], SensorLayout], None]] = {
+_WRITERS: Mapping[str, Callable[[Path, Masks, Sequence[str], _Places], None]] = {
     ".npz": _npz,
     ".parquet": _parquet,
     ".zarr": _zarr,

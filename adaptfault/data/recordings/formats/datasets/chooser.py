@@ -57,6 +57,7 @@ from adaptfault.data.recordings.formats.datasets.table import NUMBERS as NUMBERE
 from adaptfault.data.recordings.recording import BLOCK, Block, Facts, Recording, Shape
 
 _ENDS = ("episode_ends", "lengths", "episode_lengths")
+_INDEX = "index"
 _SHOWN = 12  # arrays in a message
 _BESIDE = ("", "data", "meta")  # groups in which arrays of the whole file stand
 _ROOM = 64 << 20  # bytes of readings that are read at once
@@ -145,7 +146,8 @@ def recordings_of(
                 blocks = partial(_refused, path, part, chooser.sizes(part), sizes)
             name = None if part.name is None else f"{path.name}, {part.name}"
             number = part.number if isinstance(part.number, int) else None
-            found.append(Recording(facts, blocks, name, part.label, part.names, number))
+            row = chooser.row(part)
+            found.append(Recording(facts, blocks, name, part.label, part.names, number, row))
     return found
 
 
@@ -285,6 +287,16 @@ class _Chooser:
             cells = math.prod(self.shape)
             return math.prod(sizes[1:]) != cells and math.prod(sizes[2:]) == cells
         return len(sizes) == 5 or last_part(names[0]) in ("frames", "recordings")
+
+    def row(self, part: _Part) -> int | None:
+        """Return what a table calls the first row of a recording: its column ``index``, or its
+        place; None where the file is no table."""
+        if not self.contents.is_table:
+            return None
+        column = self.contents.arrays.get(_INDEX)
+        if column is None or column.dtype.kind not in "iu" or part.first == part.last:
+            return part.first
+        return int(np.asarray(column[part.first : part.first + 1]).ravel()[0])
 
     def _length(self, name: str) -> int:
         shape = self.contents.arrays[name].shape

@@ -4,7 +4,8 @@ Every write, rename, removal, fsync and directory sync of a save, a maintenance 
 a rollback and a recording is noted. For every prefix of these steps, every state of the disk is
 built that POSIX allows after a power cut: what was not synced may be there, be lost, or be there in
 part, in any order. After each state the bundle must open, predict as one of the two versions, and
-take the next confirmation; what was acknowledged must be there. Without ``--all`` a fixed-seed
+take the next confirmation; what was acknowledged must be there. The bundle is signed where
+cryptography is installed: what runs must be signed in each state. Without ``--all`` a fixed-seed
 sample of the states is checked.
 """
 
@@ -60,8 +61,37 @@ def small_versions() -> Iterator[None]:
         yield
 
 
-def make(folder: Path) -> Any:
-    """Return a new bundle of a linear classifier in ``folder``."""
+@dataclass(frozen=True)
+class Keys:
+    """Who signs the bundle, and whom the robot trusts.
+
+    Attributes:
+        private: PEM file of the key that signs; None: it is not signed.
+        trusted: PEM files of the public keys, as ``Bundle.open`` takes them.
+    """
+
+    private: Path | None = None
+    trusted: tuple[Path, ...] | None = None
+
+    @classmethod
+    def written(cls, folder: Path) -> Keys:
+        """Write a new key into a folder; none where cryptography is not installed."""
+        try:
+            from cryptography.hazmat.primitives import serialization as to
+            from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+        except ImportError:
+            return cls()
+        path = folder / "private.pem"
+        key = Ed25519PrivateKey.generate()
+        path.write_bytes(
+            key.private_bytes(to.Encoding.PEM, to.PrivateFormat.PKCS8, to.NoEncryption())
+        )
+        return cls(path, (path,))  # a private key stands for its public one
+
+
+def make(folder: Path, sign: Path | None = None) -> Any:
+    """Return a new bundle of a linear classifier in ``folder``; ``sign``: the key that signs
+    it."""
     import torch
 
     import adaptfault as af
@@ -75,7 +105,7 @@ def make(folder: Path) -> Any:
     adapter = af.Adapter(model, training, validation, layout=LAYOUT)
     diagnoser = SelfDiagnosis(LAYOUT).fit(grasps.frames)
     return af.Bundle.create(
-        folder / NAME, adapter.model, adapter, diagnoser, check=test, class_names=CLASSES
+        folder / NAME, adapter.model, adapter, diagnoser, check=test, class_names=CLASSES, sign=sign
     )
 
 
@@ -122,18 +152,18 @@ class Operation:
     next: tuple[str, ...] = ("unchanged", "deployed")
 
 
-def operations(home: Path) -> Iterator[Operation]:
+def operations(home: Path, keys: Keys) -> Iterator[Operation]:
     """Make a bundle and trace each operation on it; call within :func:`small_versions`."""
     import adaptfault as af
     from adaptfault.bundle.versions import Versions
 
     trace = Trace(home)
     with trace.recording():
-        bundle = make(home)
+        bundle = make(home, keys.private)
     yield Operation("save", trace, (1,))
     trace = Trace(home)
     with trace.recording():
-        report = af.maintain(bundle, broken_log())
+        report = af.maintain(bundle, broken_log(), sign=keys.private)
     assert report.decision == "deployed", report
     yield Operation("maintain", trace, (1, 2), True, ("deployed",))
     trace = Trace(home)
@@ -163,9 +193,16 @@ def operations(home: Path) -> Iterator[Operation]:
 
 
 def check(
-    operation: Operation, tree: Tree, complete: bool, home: Path, expected: dict[int, Any], x: Any
+    operation: Operation,
+    tree: Tree,
+    complete: bool,
+    home: Path,
+    expected: dict[int, Any],
+    x: Any,
+    keys: Keys,
 ) -> None:
-    """Raise AssertionError where a robot that starts from this state is not right."""
+    """Raise AssertionError where a robot that starts from this state, and trusts these keys, is not
+    right."""
     import adaptfault as af
     from adaptfault.bundle.pointer import Pointer
 
@@ -185,21 +222,29 @@ def check(
         )
         runs = tuple(run["what"] for run in af.Bundle.open(path).journal.runs())
         assert runs == operation.runs, f"the journal holds {runs}, expected {operation.runs}"
-    predictor = af.Predictor.load(path)
+    predictor = af.Predictor.load(path, keys=keys.trusted)
     assert predictor.version in operation.versions, f"version {predictor.version} runs"
     assert predictor.version == before.active, (
         f"version {before.active} was active, {predictor.version} runs"
     )
     assert (predictor.predict(x) == expected[predictor.version]).all(), "it predicts otherwise"
     assert predictor.confirm(), "the version cannot be confirmed"
-    bundle = af.Bundle.open(path)
+    bundle = af.Bundle.open(path, keys=keys.trusted)
     assert bundle.active().number == predictor.version, "the confirmation changed the version"
-    problems = [text for text in bundle.problems() if "is readable" not in text]
+    problems = [text for text in damage(bundle) if "is readable" not in text]
     assert not problems, f"damage: {problems}"
-    report = af.maintain(bundle, broken_log())
+    report = af.maintain(bundle, broken_log(), sign=keys.private)
     assert report.decision in operation.next, f"the next maintenance run: {report}"
     assert report.fault_set == set(ROW.cells), f"the next maintenance run: {report}"
-    assert not bundle.problems(), f"damage after it: {bundle.problems()}"
+    assert not damage(bundle), f"damage after it: {damage(bundle)}"
+    again = af.Bundle.open(path, keys=keys.trusted)
+    assert again.active().number == report.version, "what the next run deployed does not run"
+
+
+def damage(bundle: Any) -> list[str]:
+    """Return what is damaged; a version that was not deployed yet is not signed, and runs
+    nowhere."""
+    return [text for text in bundle.problems() if "is not signed" not in text]
 
 
 class _AtOnce:
@@ -294,10 +339,13 @@ def run(
 
     with small_versions():
         (home / "robot").mkdir()
-        traced = list(operations(home / "robot"))
+        keys = Keys.written(home)
+        traced = list(operations(home / "robot", keys))
         x, expected = predictions(af.Bundle.open(home / "robot" / NAME))
         for one in traced:
-            attempt(one.name, one.trace, lambda t, c, p, one=one: check(one, t, c, p, expected, x))
+            attempt(
+                one.name, one.trace, lambda *state, one=one: check(one, *state, expected, x, keys)
+            )
         (home / "log").mkdir()
         trace, frames = traced_recording(home / "log")
         attempt("recording", trace, lambda t, c, p: check_recording(t, c, p, frames))

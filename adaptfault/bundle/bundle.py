@@ -18,6 +18,7 @@ from uuid import uuid4
 
 from adaptfault.bundle.checksummed_json import (
     Damaged,
+    Sealed,
     damage,
     decoding,
     read_with_copy,
@@ -36,6 +37,7 @@ from adaptfault.bundle.signature import verify
 from adaptfault.bundle.signing import sign_bundle, sign_versions
 from adaptfault.bundle.versions import Version, Versions
 from adaptfault.data.atomic import make_folder, sync, sync_tree
+from adaptfault.data.shortage import is_shortage
 from adaptfault.models.store import InMemory
 from diagnostics import FaultSet, SelfDiagnosis, SensorLayout
 
@@ -50,6 +52,8 @@ if TYPE_CHECKING:
     from adaptfault.models.network import TactileTransformer
 
 SCHEMA = "adaptfault.bundle/1"
+WITHOUT_ONNX = "without_onnx"
+"""In ``about`` of a version: there was too little memory for its ONNX file."""
 
 _ABOUT = "bundle.json"
 _PARTS = "parts"
@@ -457,12 +461,38 @@ class Bundle:
 
     def write_version(self, adaptation: Adaptation, about: dict[str, Any]) -> Version:
         """Write an adaptation as a new version without activating it."""
+        files = InMemory()
+        adaptation.save(files)
+        if _lacks_memory_for_onnx(files, self.parts.graph):
+            about = {**about, WITHOUT_ONNX: True}
+        length = adaptation.model.network.length
+        return self._write_version(files, length, adaptation.fault_set, about)
+
+    def with_onnx(self, version: Version) -> Version | None:
+        """Write a version again with the ONNX file for which there was too little memory.
+
+        Returns:
+            The new version, not active yet; None where ``version`` lacks none for this reason, or
+            there is still too little memory.
+        """
+        if WITHOUT_ONNX not in version.about or version.hashes is None:
+            return None
+        sealed = Sealed(version.folder, version.hashes)
+        files = InMemory({name: sealed.read(name) for name in version.hashes})
+        if _lacks_memory_for_onnx(files, self.parts.graph):
+            return None
+        about = {name: value for name, value in version.about.items() if name != WITHOUT_ONNX}
+        return self._write_version(files, version.length, version.fault_set, about)
+
+    def _write_version(
+        self, files: InMemory, length: int, fault_set: FaultSet, about: dict[str, Any]
+    ) -> Version:
         version = self.versions.write(
-            _files(adaptation, self.parts.graph),
+            files,
             layout=self.layout,
             class_names=self.class_names,
-            length=adaptation.model.network.length,
-            fault_set=adaptation.fault_set,
+            length=length,
+            fault_set=fault_set,
             about=about,
         )
         pointer = Pointer.read(self.path)
@@ -520,15 +550,17 @@ def _graph(adapter: Adapter) -> bytes | None:
     return None
 
 
-def _files(adaptation: Adaptation, graph: bytes | None) -> InMemory:
-    """Return the files of an adaptation, its ONNX file included; without that the version runs on
-    torch."""
+def _lacks_memory_for_onnx(files: InMemory, graph: bytes | None) -> bool:
+    """Add the ONNX file to those of a version, which runs on torch without it; return whether it is
+    missing for want of memory, so that a later run may add it."""
     from adaptfault.prediction.export import ExportError, add_onnx
 
-    files = InMemory()
-    adaptation.save(files)
     try:
         add_onnx(files, graph)
-    except (ImportError, ExportError) as error:
+    except Exception as error:
+        lacks_memory = is_shortage(error)
+        if not lacks_memory and not isinstance(error, ImportError | ExportError):
+            raise
         _log.warning("no ONNX export, this version runs on torch: %s", error)
-    return files
+        return lacks_memory
+    return False

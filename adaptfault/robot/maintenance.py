@@ -158,7 +158,11 @@ def _idle(run: MaintenanceRun, fresh: Sequence[IncomingRecording]) -> Maintenanc
             run, _Outcome("refused", (Reason(UNKNOWN, "no recording is usable"),), run.known)
         )
     reason = Reason(_severity(run, run.known.fault_set), "all recordings were used before")
-    return _report(run, _Outcome("unchanged", (reason,), run.known))
+    outcome = _with_onnx(run, _Outcome("unchanged", (reason,), run.known))
+    report = _report(run, outcome)
+    if outcome.deploys is not None:
+        _write(run, outcome, report, ())
+    return report
 
 
 def _maintained(
@@ -173,7 +177,7 @@ def _maintained(
         run.version.undo(recording.frames) for recording in usable if recording.frames is not None
     ]
     inspection = inspect(frames, run.robot.diagnoser, reference=run.robot.healthy)
-    outcome = _decide(run, inspection)
+    outcome = _with_onnx(run, _decide(run, inspection))
     report = _report(run, outcome, inspection, untested_code)
     if outcome.used:
         report = replace(report, used=tuple(recording.name for recording in usable))
@@ -182,6 +186,27 @@ def _maintained(
     if not run.dry_run:
         _write(run, outcome, report, usable)
     return report
+
+
+def _with_onnx(run: MaintenanceRun, outcome: _Outcome) -> _Outcome:
+    """Return an outcome that keeps the running version with one that deploys the same with its ONNX
+    file, where that lacks it for want of memory."""
+    if run.dry_run or outcome.decision not in ("unchanged", "kept"):
+        return outcome
+    whole = run.robot.bundle.with_onnx(run.version)
+    if whole is None:
+        return outcome
+    text = f"version {whole.number} is version {run.version.number} with its ONNX file"
+    judged = outcome.judged
+    if judged is not None:
+        judged = {**judged, "version": whole.number}
+    return replace(
+        outcome,
+        decision="deployed",
+        reasons=(*outcome.reasons, Reason(0, text)),
+        deploys=whole.number,
+        judged=judged,
+    )
 
 
 def _decide(run: MaintenanceRun, inspection: Inspection) -> _Outcome:

@@ -19,7 +19,10 @@ from adaptfault.bundle.checksummed_json import Damaged, write_checksummed, write
 from adaptfault.bundle.parts import Parts
 from adaptfault.bundle.signing import sign_bundle
 from adaptfault.bundle.versions import Version
+from adaptfault.cli import main
 from adaptfault.data.calibration import Calibration
+from adaptfault.data.recordings import save_npz
+from adaptfault.data.simulated_grasps import simulate
 from adaptfault.prediction.predictor import Predictor
 from adaptfault.robot.maintenance import maintain
 from diagnostics import FaultSet
@@ -258,3 +261,44 @@ def test_a_kill_of_a_signing_run_leaves_what_runs_signed_and_the_next_run_ends_i
     again = Bundle.open(signed, keys=[keys[1]])
     assert again.active().fault_set == set(power_cut.ROW.cells)
     assert [run["what"] for run in again.journal.runs()].count("deployed") == 1
+
+
+def test_a_bundle_is_signed_before_it_has_its_name(signed, keys, tmp_path, monkeypatch):
+    bundle = Bundle.open(signed)
+    parts = bundle.parts
+    replace = os.replace
+    out = tmp_path / "new.bundle"
+
+    def cut_off(source, target):
+        replace(source, target)
+        if Path(target) == out:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(os, "replace", cut_off)
+    with power_cut.small_versions(), pytest.raises(KeyboardInterrupt):
+        Bundle.create(
+            out,
+            parts.adapter().model,
+            parts.adapter(),
+            bundle.diagnoser(),
+            check=parts.check_windows(),
+            sign=keys[0],
+        )
+    assert Bundle.open(out, keys=[keys[1]]).active().number == 1
+
+
+def test_a_training_that_was_cut_off_after_its_bundle_was_whole_is_ended_by_the_same_command(
+    signed, keys, tmp_path, capsys
+):
+    save_npz(tmp_path / "grasps.npz", simulate(3, power_cut.LAYOUT, n_frames=20))
+    left = tmp_path / ".robot.bundle.training"
+    left.mkdir()
+    (left / "training.safetensors").touch()
+    words = ["train", str(tmp_path / "grasps.npz"), "--out", str(signed), "--quiet"]
+    assert main([*words, "--sign", str(write_keys(tmp_path, "other")[0])]) == 3
+    assert "not signed by one of the 1 trusted keys" in capsys.readouterr().err
+    assert main([*words, "--sign", str(keys[0])]) == 0
+    assert "cut off at its end" in capsys.readouterr().out
+    assert not left.exists()
+    assert main([*words, "--sign", str(keys[0])]) == 3  # a bundle of this name is there
+    assert "exists: choose another name" in capsys.readouterr().err

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from adaptfault.adaptation.reduced_model import ReducedModel, phi
-from adaptfault.data.windows import Windows
+from adaptfault.data.windows import Windows, finite_windows
 from adaptfault.evaluation.class_recall import ClassRecall, class_recalls
 from adaptfault.evaluation.scores import Scores, ValueScores
 from adaptfault.imputation.linear import AffineFill, NearestFill
@@ -83,7 +83,8 @@ class Adaptation:
         """Return the class of each window ``[N, T, D]``, int64 ``[N]``, or its values, float32
         ``[N, k]``.
 
-        The cells in F may hold anything, NaN included.
+        The cells in F may hold anything, NaN included; a missing reading of another cell is held
+        from the frame before.
         """
         outputs = self._logits(x)
         answers: NDArray[Any] = (
@@ -103,7 +104,8 @@ class Adaptation:
         return probabilities
 
     def _logits(self, x: NDArray[Any] | Tensor) -> Tensor:
-        return logits_of(self.model, phi(np.asarray(x, dtype=np.float32), self.fault_set))
+        healthy = phi(np.asarray(x, dtype=np.float32), self.fault_set)
+        return logits_of(self.model, finite_windows(healthy))
 
     @cached_property
     def scores(self) -> Scores | ValueScores:

@@ -93,6 +93,18 @@ def hold_missing(frames: NDArray[Any]) -> NDArray[Any]:
     )
 
 
+def finite_windows(x: NDArray[Any]) -> NDArray[np.float32]:
+    """Return windows ``[N, T, D]`` on the 0..1 scale without missing or invalid readings."""
+    x = np.asarray(x, dtype=np.float32)
+    if x.ndim != 3 or not x.size or bool(((x >= -1) & (x <= 2)).all()):  # NaN compares as False
+        return x
+    missing = ~((x >= -1) & (x <= 2))  # as for a layout of full scale 1
+    held: NDArray[np.float32] = np.stack(
+        [hold_missing(window) for window in np.where(missing, np.float32(np.nan), x)]
+    )
+    return held
+
+
 def make_windows(
     recordings: Sequence[ArrayLike],
     targets: ArrayLike | Sequence[ArrayLike] | None,

@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from adaptfault.bundle.bundle import PROCESS
 from adaptfault.bundle.checksummed_json import Damaged, decoding
 from adaptfault.bundle.pointer import file_stamp
-from adaptfault.data.windows import hold_missing, scale
+from adaptfault.data.windows import finite_windows, scale
 from adaptfault.inspection.converter_range import within_range
 from adaptfault.models.accumulation import ContactDecision
 from adaptfault.prediction.inference import Inference
@@ -221,7 +221,7 @@ class Predictor:
         """Return the class of each window ``[N, T, D]`` on the 0..1 scale, int64 ``[N]``, or its
         values, float32 ``[N, k]``."""
         self._keep_up()
-        return self._running.model.predict(self._rewired(_finite(x)))
+        return self._running.model.predict(self._rewired(finite_windows(x)))
 
     def predict_proba(self, x: NDArray[Any]) -> NDArray[np.float32]:
         """Return class probabilities ``[N, n_classes]`` of windows ``[N, T, D]``; F's cells may
@@ -231,7 +231,7 @@ class Predictor:
             ValueError: the model is a regression.
         """
         self._keep_up()
-        return self._running.model.predict_proba(self._rewired(_finite(x)))
+        return self._running.model.predict_proba(self._rewired(finite_windows(x)))
 
     def prediction_sets(
         self, x: NDArray[Any], alpha: float = 0.1, *, by_class: bool = False
@@ -239,7 +239,7 @@ class Predictor:
         """Return the sets of classes of windows ``[N, T, D]``, as
         :meth:`~adaptfault.prediction.inference.Inference.prediction_sets`."""
         self._keep_up()
-        x = self._rewired(_finite(x))
+        x = self._rewired(finite_windows(x))
         return self._running.model.prediction_sets(x, alpha, by_class=by_class)
 
     def stream(self, frame: ArrayLike, time: float | None = None) -> Reading:
@@ -421,18 +421,6 @@ def _start(bundle: Bundle, version: Version, layout: SensorLayout) -> _Running:
     model.predict(np.zeros((1, model.length, layout.n_cells), np.float32))
     _ = version.readings  # raises Damaged
     return _Running(version, model, bundle)
-
-
-def _finite(x: NDArray[Any]) -> NDArray[np.float32]:
-    """Return windows ``[N, T, D]`` on the 0..1 scale without missing or invalid readings."""
-    x = np.asarray(x, dtype=np.float32)
-    if x.ndim != 3 or not x.size or bool(((x >= -1) & (x <= 2)).all()):  # NaN compares as False
-        return x
-    missing = ~((x >= -1) & (x <= 2))  # as for a layout of full scale 1
-    held: NDArray[np.float32] = np.stack(
-        [hold_missing(window) for window in np.where(missing, np.float32(np.nan), x)]
-    )
-    return held
 
 
 def _start_any(bundle: Bundle) -> _Running:

@@ -149,6 +149,16 @@ def test_the_value_of_a_dropped_cell_never_reaches_the_output(quick, working_clo
     assert np.isfinite(before).all()
 
 
+def test_a_missing_reading_outside_f_is_held_from_the_frame_before(adapter):
+    adaptation = adapter.adapt([3], method="fill")
+    x = adapter.validation.x[:4].copy()
+    held = x.copy()
+    held[:, 5, 7] = held[:, 4, 7]
+    x[:, 5, 7] = np.nan
+    x[:, :, 3] = np.nan
+    np.testing.assert_array_equal(adaptation.predict_proba(x), adaptation.predict_proba(held))
+
+
 def test_the_reduced_model_refuses_windows_with_the_faulty_cells_still_in(adapter):
     reduced = ReducedModel(adapter.model, F, AffineFill(F, np.zeros((5, D - 5)), np.zeros(5)))
     with pytest.raises(ValueError, match="27 healthy cells"):

@@ -1,5 +1,6 @@
 """Labels by table."""
 
+import numpy as np
 import pytest
 from recording_files import messages, newtons, refusal, write
 
@@ -73,3 +74,15 @@ def test_a_file_beside_the_class_folders_is_left_out_with_a_warning(tmp_path):
     loaded = load(tmp_path)
     assert loaded.recordings.names == ("good/a.csv",)
     assert "stray.csv: lies beside the folders of the classes" in messages(loaded, "warning")[0]
+
+
+def test_classes_that_no_folder_may_be_called_are_written_apart(tmp_path):
+    from adaptfault.data.recordings import Recordings, save
+    from diagnostics import SensorLayout
+
+    names = ("a/b", "a:b", "A:b", "..", "a_b 2")
+    frames = tuple(np.full((5, 6), i / 10 + 0.1) for i in range(len(names)))
+    layout = SensorLayout(1, 2, 3, full_scale=1.0)
+    save(tmp_path / "out", Recordings(frames, layout, np.arange(len(names)), names))
+    again = load(tmp_path / "out").recordings
+    assert len(set(again.class_names)) == len(set(again.labels.tolist())) == len(names)

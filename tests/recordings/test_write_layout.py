@@ -40,11 +40,16 @@ def test_what_was_inferred_is_written_with_its_reasons_and_then_stated(tmp_path,
     full_scale=st.floats(0.1, 65535),
     unit=st.text(st.characters().filter(str.isprintable), min_size=1, max_size=5),
     seed=st.integers(0, 99),
+    name=st.none() | st.text(st.characters(exclude_categories=("Cs",)), min_size=1, max_size=5),
 )
-def test_every_layout_is_read_as_it_was_written(tmp_path_factory, sizes, full_scale, unit, seed):
+def test_every_layout_is_read_as_it_was_written(
+    tmp_path_factory, sizes, full_scale, unit, seed, name
+):
     present = np.random.default_rng(seed).random(sizes) < 0.7
     present[0, 0, 0] = True
-    layout = SensorLayout(*sizes, full_scale=full_scale, unit=unit, present=present)
+    cells = np.flatnonzero(present)
+    groups = None if name is None else {name: cells[::2].tolist()}
+    layout = SensorLayout(*sizes, full_scale=full_scale, unit=unit, present=present, groups=groups)
     path = tmp_path_factory.mktemp("layout") / "layout.toml"
     write_layout(path, layout, ["a reason\nof two lines"])
     assert read_layout(path) == layout

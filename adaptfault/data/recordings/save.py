@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import re
+from collections.abc import Sequence
 from os import PathLike
 from pathlib import Path
 
@@ -92,10 +93,11 @@ def _save_csv(path: Path, recordings: Recordings, times: bool) -> tuple[str, ...
         raise InputError.at(path, "the folder is not empty; choose another name")
     atomic_write(path / LAYOUT_NAME, json.dumps(recordings.layout.to_dict(), indent=1).encode())
     digits = len(str(len(recordings) - 1))
+    folders = _folders(recordings.class_names)
     for i, frames in enumerate(recordings):
         folder = path
         if recordings.labels is not None:
-            folder = path / _safe(recordings.class_names[int(recordings.labels[i])])
+            folder = path / folders[int(recordings.labels[i])]
             folder.mkdir(exist_ok=True)
         rows = [",".join(map(_written, row)) for row in frames.tolist()]
         if times:
@@ -118,9 +120,21 @@ def _written(value: float) -> str:
     return "" if value != value else f"{value:.9g}"
 
 
-def _safe(name: str) -> str:
-    """Return a class name as the name of a folder."""
-    return re.sub(r"[^\w. +-]", "_", name).strip(". ") or "_"
+def _folders(names: Sequence[str]) -> list[str]:
+    """Return the name of a folder for each class; those that differ only in what no folder may be
+    called, or in case, are numbered."""
+    folders: list[str] = []
+    taken: set[str] = set()
+    for name in names:
+        plain = re.sub(r"[^\w. +-]", "_", name).strip(". ") or "_"
+        folder = plain
+        number = 2
+        while folder.casefold() in taken:
+            folder = f"{plain} {number}"
+            number += 1
+        taken.add(folder.casefold())
+        folders.append(folder)
+    return folders
 
 
 def _save_bag(path: Path, recordings: Recordings) -> tuple[str, ...]:

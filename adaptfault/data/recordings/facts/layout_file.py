@@ -163,13 +163,18 @@ def write_layout(
     """
     lines = ["# The array: pads x rows x columns, range, unit and rate."]
     lines += [f"# inferred: {' '.join(printable(reason).split())}" for reason in reasons]
-    # a JSON value other than null is one of TOML
-    lines += [
-        f"{name} = {json.dumps(value, ensure_ascii=False)}"
-        for name, value in layout.to_dict().items()
-        if value is not None
-    ]
+    fields = layout.to_dict()
+    groups = fields.pop("groups", None)
+    lines += [f"{name} = {_toml(value)}" for name, value in fields.items() if value is not None]
+    if groups is not None:
+        lines += ["", "[groups]"]
+        lines += [f"{_toml(name)} = {_toml(cells)}" for name, cells in groups.items()]
     atomic_write(Path(path), ("\n".join(lines) + "\n").encode())
+
+
+def _toml(value: Any) -> str:
+    """Return a number, text or list as TOML: as JSON, but for one character that TOML escapes."""
+    return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
 
 
 def _document(path: Path) -> dict[str, Any]:

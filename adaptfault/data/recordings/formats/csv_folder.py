@@ -45,7 +45,7 @@ from adaptfault.data.recordings.formats.text import (
 )
 from adaptfault.data.recordings.recording import Block, Facts, Recording, Shape
 
-SUFFIXES = (".csv", ".txt", ".tsv", ".asc")
+SUFFIXES = (".csv", ".txt", ".tsv", ".asc", ".asf")
 
 _TABLES = (".csv", ".tsv")
 """Suffixes of files that are tables; others may be notes."""

@@ -42,6 +42,7 @@ from diagnostics.faults import Fault, FaultKind
 from diagnostics.healthy.reference_faults import find_reference_faults, never_moved
 from diagnostics.layout import SensorLayout
 from diagnostics.preprocessing.array_likes import plain_array
+from diagnostics.preprocessing.copies import find_copies
 from diagnostics.preprocessing.levels import (
     CERTAIN_RATIO,
     DOUBTED,
@@ -101,10 +102,13 @@ class SelfDiagnosis:
         reference_: the healthy reference, after :meth:`fit`; None: cold start.
         calibrator_: calibration of the log likelihood ratios; defaults before :meth:`fit`.
         load_: how readings become loads; None: load raises the reading.
+        copies_: int ``[n]``, of which recording each one of the reference is a copy; its own number
+            where it is none. None: not fitted.
     """
 
     reference_: Reference | None = None
     calibrator_: Calibrator = Calibrator.cold()
+    copies_: NDArray[np.intp] | None = None
     _certificate: Certificate | None = None
     _held_out: tuple[Sequence[NDArray[Any]], NDArray[np.float64]] | None = None
 
@@ -143,6 +147,7 @@ class SelfDiagnosis:
             )
         SelfDiagnosis.__init__(self, **(known | params))
         self.reference_ = None
+        self.copies_ = None
         self.calibrator_ = Calibrator.cold()
         self._certificate = None
         self._held_out = None
@@ -166,7 +171,9 @@ class SelfDiagnosis:
         """Fit to fault-free recordings, ``[T, D]`` or a list of them.
 
         Cells that are dead in them are found first and excluded; they are reported in every log in
-        which they do not move.
+        which they do not move. Recordings that are copies of others are left out
+        (:mod:`diagnostics.preprocessing.copies`): they would tell how a log repeats, not how
+        another one differs.
 
         Args:
             recordings: as :meth:`SensorLayout.recordings` takes them.
@@ -178,7 +185,10 @@ class SelfDiagnosis:
         """
         log = checked_recordings(recordings, self.layout)
         with one_thread():
-            return self._fit(RecordingBlocks(measured(log, self.layout)), progress)
+            given = measured(log, self.layout)
+            self.copies_ = find_copies(given)
+            independent = np.unique(self.copies_)
+            return self._fit(RecordingBlocks([given[i] for i in independent]), progress)
 
     def _fit(
         self,

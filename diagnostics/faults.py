@@ -129,7 +129,8 @@ class Fault:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "kind", FaultKind(self.kind))
-        cells = np.unique(np.atleast_1d(np.asarray(self.cells)))
+        cells = np.atleast_1d(np.asarray(self.cells))
+        cells = np.unique(np.flatnonzero(cells) if cells.dtype == bool else cells)
         if cells.size == 0 or not np.issubdtype(cells.dtype, np.integer) or cells[0] < 0:
             raise ValueError(
                 f"a fault needs at least one cell index, whole and >= 0; got {self.cells!r}"
@@ -203,7 +204,8 @@ _KINDS: Mapping[str, tuple[type, ...]] = {
 class FaultSet(Set[int]):
     """The paper's F (Section IV): the cells whose values must not be used, out of ``n_cells``.
 
-    Behaves as a set (``in``, ``len``, iteration in ascending order, ``| & - ==``).
+    Behaves as a set (``in``, ``len``, iteration in ascending order, ``| & - ==``). ``cells`` may be
+    a mask, bool ``[D]``.
 
     Raises:
         ValueError: a cell that is not a whole number from 0 to ``n_cells - 1``; sets over different
@@ -222,7 +224,12 @@ class FaultSet(Set[int]):
             raise ValueError(
                 f"F needs the number of cells, a whole number >= 0; got {self.n_cells!r}"
             )
-        cells = np.unique(np.asarray(list(self.cells)))
+        cells = np.asarray(list(self.cells))
+        if cells.size and cells.dtype == bool:
+            if cells.size != self.n_cells:
+                raise ValueError(f"F is a mask of {cells.size} cells, expected {self.n_cells}")
+            cells = np.flatnonzero(cells)
+        cells = np.unique(cells)
         if cells.size and not np.issubdtype(cells.dtype, np.integer):
             raise ValueError(f"F holds cell indices, whole numbers; got {self.cells!r}")
         if cells.size and (cells[0] < 0 or cells[-1] >= self.n_cells):
@@ -236,17 +243,21 @@ class FaultSet(Set[int]):
 
     @classmethod
     def of(cls, cells: Cells, n_cells: int) -> FaultSet:
-        """Return F over ``n_cells`` cells from a fault set, or from any list of cells.
+        """Return F over ``n_cells`` cells from a fault set, a mask, bool ``[D]``, or any list of
+        cells.
 
         Raises:
-            ValueError: a fault set over another number of cells, or what is no cell of the array.
+            ValueError: a fault set or a mask over another number of cells, or what is no cell of
+                the array.
         """
         if isinstance(cells, FaultSet):
             if cells.n_cells != n_cells:
                 raise ValueError(f"F is over {cells.n_cells} cells, expected one over {n_cells}")
             return cells
         if not isinstance(cells, Iterable) or isinstance(cells, str | bytes | Mapping):
-            raise ValueError(f"F is a fault set or a list of cells, got {str(cells)[:60]!r}")
+            raise ValueError(
+                f"F is a fault set, a list of cells or a mask, got {str(cells)[:60]!r}"
+            )
         return cls(tuple(cells), n_cells)
 
     @cached_property
@@ -306,4 +317,4 @@ class FaultSet(Set[int]):
 
 
 Cells: TypeAlias = FaultSet | Iterable[int]
-"""F, wherever one is taken: a fault set, or any list of cells."""
+"""F, wherever one is taken: a fault set, any list of cells, or a mask, bool ``[D]``."""

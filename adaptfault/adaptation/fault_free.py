@@ -62,6 +62,9 @@ class FaultFreeModel:
                 " empty"
             )
         _check_windows(train, validation)
+        # a copy would be held out of a fold that learns from it
+        train = train.independent
+        validation = validation.independent
         self.task = _task(task, train, validation)
         self.loss = loss
         self.model = _wrapped(model, train, layout, features)

@@ -13,6 +13,7 @@ from adaptfault.data.determination import explained
 from adaptfault.evaluation.class_recall import ClassRecall, class_recalls
 from adaptfault.evaluation.scores import mean_interval, prediction_interval
 from diagnostics import FaultSet
+from diagnostics.shown import shown
 
 SCHEMA = "adaptfault.forecast/1"
 
@@ -68,6 +69,7 @@ class Expected:
         return cls(r2, r2 - wider * (r2 - low), min(1.0, r2 + wider * (high - r2)), r2)
 
 
+@shown
 @dataclass(frozen=True)
 class Forecast:
     """Expected accuracy of each stage of a repair, in the order of their cost.

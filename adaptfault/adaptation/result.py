@@ -32,6 +32,7 @@ from adaptfault.models.store import (
     save_tensors,
 )
 from diagnostics import FaultSet
+from diagnostics.shown import shown
 
 
 @dataclass(frozen=True)
@@ -57,6 +58,7 @@ class Stage:
         return f"{self.name}: {self.seconds:.2f} s{reached}"
 
 
+@shown
 @dataclass(frozen=True, eq=False)
 class Adaptation:
     """A model adapted to F.
@@ -78,6 +80,10 @@ class Adaptation:
     _contact: ContactStatistics | None = field(default=None, repr=False)
     _conformal: PredictionSets | None = field(default=None, repr=False)
     _recalls: tuple[ClassRecall, ...] = field(default=(), repr=False)
+
+    def __str__(self) -> str:
+        left_out = f"{self.task} without {len(self.fault_set)} cells"
+        return "\n".join([left_out, *(f"  {stage}" for stage in self.stages)])
 
     def predict(self, x: NDArray[Any] | Tensor) -> NDArray[Any]:
         """Return the class of each window ``[N, T, D]``, int64 ``[N]``, or its values, float32

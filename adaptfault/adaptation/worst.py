@@ -19,6 +19,7 @@ import numpy as np
 
 from adaptfault.adaptation.forecast import Expected
 from diagnostics import FaultSet, SensorLayout
+from diagnostics.shown import shown
 
 if TYPE_CHECKING:
     from adaptfault.adaptation.adapter import Adapter
@@ -41,6 +42,7 @@ class Loss:
     expected: Expected
 
 
+@shown
 @dataclass(frozen=True, eq=False)
 class WorstFaults:
     """Faults in the order of the mean probability of the true class after repair, lowest first.

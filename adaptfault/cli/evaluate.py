@@ -121,7 +121,7 @@ def _of_classes(classifier: Adaptation, windows: Windows) -> tuple[Any, ...]:
     predicted = probabilities.argmax(axis=1)
     scores = Scores.of(windows.y, predicted, n_classes=probabilities.shape[1])
     whole_recordings = recording_scores(probabilities, windows)
-    interval = accuracy_interval(predicted == windows.y, windows.recording)
+    interval = accuracy_interval(predicted == windows.y, windows.sources)
     result = {
         "scores": scores.to_dict(),
         "accuracy_interval": list(interval),
@@ -151,7 +151,7 @@ def _of_values(regression: Adaptation, windows: Windows, names: Sequence[str]) -
     predicted = regression.predict(windows.x)
     scores = ValueScores.of(windows.y, predicted)
     result: dict[str, Any] = {"scores": scores.to_dict(), "value_names": list(names)}
-    low, high = mean_interval(explained(windows.y, predicted).mean(axis=1), windows.recording)
+    low, high = mean_interval(explained(windows.y, predicted).mean(axis=1), windows.sources)
     if not np.isfinite(low):  # a single recording
         return {**result, "r2_interval": None}, scores.named(names)
     high = min(1.0, high)

@@ -110,6 +110,7 @@ def _inspected(
 ) -> Inspection:
     """Inspect a log, as the version of the bundle that runs reads it."""
     from adaptfault.data.recordings.check import check_scale
+    from adaptfault.data.recordings.doubts import copies
     from adaptfault.inspection.long_log import inspect_parts
     from diagnostics import SelfDiagnosis
 
@@ -119,6 +120,8 @@ def _inspected(
 
     def parts() -> Iterator[list[NDArray[Any]]]:
         for i, part in enumerate(log.parts()):
+            if i == 0:  # of a longer log, those of the first part
+                report_problems(args, copies(part, log.names))
             if is_known and i == 0:
                 report_problems(args, check_scale(args.recordings[0], part, log.layout))
             yield part if version is None else [version.undo(frames) for frames in part]

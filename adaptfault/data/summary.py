@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from diagnostics import SensorLayout
 from diagnostics.preprocessing.array_likes import is_array
+from diagnostics.shown import shown
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -22,6 +23,7 @@ _SAMPLE = 4000  # frames that the rest level and the step are taken from
 _LISTED = 8  # cells or classes that the text lists
 
 
+@shown
 @dataclass(frozen=True, eq=False)
 class Summary:
     """The content of recordings.

@@ -4,15 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from diagnostics import SensorLayout
+from diagnostics.preprocessing.copies import find_copies
 from diagnostics.preprocessing.readings import held
+from diagnostics.shown import shown
 
 
+@shown
 @dataclass(frozen=True, eq=False)
 class Windows:
     """Windows of T frames, the input of every model.
@@ -49,6 +53,20 @@ class Windows:
 
     def __len__(self) -> int:
         return len(self.x)
+
+    @cached_property
+    def sources(self) -> NDArray[np.int64]:
+        """The recording that a window is an observation of, int64 ``[N]``: its own, or the one that
+        its recording is a copy of (:mod:`diagnostics.preprocessing.copies`)."""
+        numbers, inverse = np.unique(self.recording, return_inverse=True)
+        frames = [self.x[inverse == i].reshape(-1, self.x.shape[2]) for i in range(len(numbers))]
+        return np.asarray(numbers[find_copies(frames)][inverse], np.int64)
+
+    @property
+    def independent(self) -> Windows:
+        """The windows without those of copies of a recording; the longest is kept."""
+        original = self.recording == self.sources
+        return self if original.all() else self.select(original)
 
     def __str__(self) -> str:
         n, t, d = self.x.shape
@@ -214,7 +232,7 @@ def split(
     windows: Windows, *, test: float = 0.2, validation: float = 0.2, seed: int = 0
 ) -> tuple[Windows, Windows, Windows]:
     """Return ``(train, validation, test)``, split by recording and stratified by class; those of a
-    regression by recording alone.
+    regression by recording alone. Copies of a recording lie on its side.
 
     ``validation`` is a share of the recordings outside the test set, so the defaults give 64 %, 16
     % and 20 % (Section VI-C). Every class has a recording on each side, which plain stratification
@@ -227,22 +245,23 @@ def split(
     for name, share in (("test", test), ("validation", validation)):
         if not 0 <= share < 1:
             raise ValueError(f"the {name} share must lie in [0, 1), got {share}")
-    recordings, first, inverse = np.unique(
-        windows.recording, return_index=True, return_inverse=True
-    )
     of_class = windows.y if windows.y.ndim == 1 else np.zeros(len(windows), np.int64)
-    classes = of_class[first]  # of each recording
-    if (mixed := classes[inverse] != of_class).any():
+    _, first, own = np.unique(windows.recording, return_index=True, return_inverse=True)
+    if (mixed := of_class[first][own] != of_class).any():
         raise ValueError(
             f"recording {windows.recording[mixed][0]} has windows of two classes: give each its own"
             " number"
         )
+    recordings, first, inverse = np.unique(windows.sources, return_index=True, return_inverse=True)
+    classes = of_class[first]  # of each recording
     sides = 1 + (test > 0) + (validation > 0)
     for label, count in zip(*np.unique(classes, return_counts=True), strict=True):
         if count < sides:
             found = f"class {label} has {count} recordings"
             if windows.y.ndim == 2:
                 found = f"there are {count} recordings"
+            if len(recordings) < len(np.unique(windows.recording)):
+                found += " (copies count once)"
             raise ValueError(f"{found}: a split into {sides} parts needs at least {sides}")
     rng = np.random.default_rng(seed)
     rest = np.arange(len(recordings))

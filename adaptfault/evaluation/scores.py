@@ -14,6 +14,7 @@ from sklearn.metrics import confusion_matrix, precision_recall_fscore_support
 
 from adaptfault.data.determination import r2
 from adaptfault.data.windows import Windows
+from diagnostics.shown import shown
 
 SCHEMA = "adaptfault.scores/1"
 VALUES_SCHEMA = "adaptfault.value_scores/1"
@@ -26,6 +27,7 @@ class Classifier(Protocol):
         """Return int ``[N]``."""
 
 
+@shown
 @dataclass(frozen=True, eq=False)
 class Scores:
     """Scores of a classifier on labelled windows.
@@ -130,6 +132,7 @@ class Scores:
         return ax
 
 
+@shown
 @dataclass(frozen=True)
 class ValueScores:
     """Scores of a regression of k values.

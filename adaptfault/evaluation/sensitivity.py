@@ -20,6 +20,7 @@ from tqdm import tqdm
 from adaptfault.data.windows import Windows
 from adaptfault.evaluation.scores import Classifier
 from diagnostics import Line, SensorLayout
+from diagnostics.shown import shown
 
 if TYPE_CHECKING:
     from torch import nn
@@ -62,6 +63,7 @@ class WireLoss:
         )
 
 
+@shown
 @dataclass(frozen=True, eq=False)
 class Sensitivity:
     """Loss of a classifier by single faults. V values, D cells, C classes.

@@ -13,6 +13,7 @@ from typing import Any
 from adaptfault.fleet.outcome import Outcome
 from adaptfault.robot.metrics import RobotMetrics
 from adaptfault.robot.sensor_state import weak_base
+from diagnostics.shown import shown
 
 SCHEMA = "adaptfault.fleet/1"
 STATES = ("ok", "degraded", "technician", "unknown")
@@ -78,6 +79,7 @@ class AgeGroup:
         )
 
 
+@shown
 @dataclass(frozen=True)
 class FleetReport:
     """Result of maintenance of a fleet.

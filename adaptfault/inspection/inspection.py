@@ -27,6 +27,7 @@ from diagnostics.sensor.recalibration import Recalibration
 from diagnostics.sensor.rewiring import Rewiring
 from diagnostics.sensor.sensor_change import SensorChange
 from diagnostics.sensor.shared import Shared, measured
+from diagnostics.shown import shown
 
 SCHEMA = "adaptfault.inspection/1"
 
@@ -62,6 +63,7 @@ class Finding:
     reason: str
 
 
+@shown
 @dataclass(frozen=True, eq=False)
 class Inspection:
     """What a log tells about a sensor.

@@ -6,9 +6,12 @@ import math
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal
 
+from diagnostics.shown import shown
+
 Stopped = Literal["epochs", "patience", "budget"]
 
 
+@shown
 @dataclass(frozen=True)
 class History:
     """Record of a training run.

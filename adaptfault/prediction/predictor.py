@@ -24,6 +24,7 @@ from adaptfault.inspection.converter_range import within_range
 from adaptfault.models.accumulation import ContactDecision
 from adaptfault.prediction.inference import Inference
 from diagnostics import Diagnosis, Fault, FaultSet, Monitor, SelfDiagnosis, SensorLayout
+from diagnostics.shown import shown
 
 if TYPE_CHECKING:
     from adaptfault.bundle.bundle import Bundle
@@ -36,6 +37,7 @@ _STARTS = 3  # attempts to load a version; the bundle falls back to an earlier o
 _log = logging.getLogger(__name__)
 
 
+@shown
 @dataclass(frozen=True, eq=False)
 class Reading:
     """Result of one frame.

@@ -19,6 +19,7 @@ from adaptfault.prognosis.trend import COVERAGE, FALSE, Trend, Trends, trends
 from diagnostics.decision.result import Verdict
 from diagnostics.layout import SensorLayout
 from diagnostics.sensor.ageing import STATISTICS, CellCondition
+from diagnostics.shown import shown
 from diagnostics.wiring import Line
 
 if TYPE_CHECKING:
@@ -194,6 +195,7 @@ class Series:
         return float(np.exp(level)) if self.statistic == "gain" else level
 
 
+@shown
 @dataclass(frozen=True, eq=False)
 class AgeingReport:
     """What drifts on one sensor.

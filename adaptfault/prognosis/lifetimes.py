@@ -12,6 +12,7 @@ from adaptfault.bundle.bundle import Bundle
 from adaptfault.fleet.listing import Fleet
 from adaptfault.prognosis.survival import COVERAGE, Lifetimes, Survival
 from diagnostics import Fault
+from diagnostics.shown import shown
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -55,6 +56,7 @@ class Service:
         )
 
 
+@shown
 @dataclass(frozen=True, eq=False)
 class FleetSurvival:
     """Survival of the wires and cells of a fleet.

@@ -12,6 +12,7 @@ from adaptfault.robot.sensor_state import weak_base
 from diagnostics import Diagnosis, Fault, FaultSet
 from diagnostics.decision.numbering import Numbering
 from diagnostics.sensor.sensor_change import SensorChange
+from diagnostics.shown import shown
 
 SCHEMA = "adaptfault.maintenance/1"
 Decision = Literal["unchanged", "deployed", "kept", "refused"]
@@ -19,6 +20,7 @@ Decision = Literal["unchanged", "deployed", "kept", "refused"]
 _FROM_0 = Numbering()
 
 
+@shown
 @dataclass(frozen=True, eq=False)
 class MaintenanceReport:
     """Result of a maintenance run.

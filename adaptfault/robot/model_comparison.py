@@ -104,7 +104,7 @@ def compare_candidate(
     predicted = running(windows.x), candidate(windows.x)
     # [2, N]
     right = np.stack([_of_windows(windows.y, given) for given in predicted])
-    recordings, inverse = np.unique(windows.recording, return_inverse=True)
+    recordings, inverse = np.unique(windows.sources, return_inverse=True)
     size = np.bincount(inverse).astype(float)
     won = np.bincount(inverse, weights=right[1] - right[0])
     rng = np.random.default_rng(seed)
@@ -126,7 +126,7 @@ def compare_candidate(
 def _recalls(predicted: NDArray[Any], windows: Windows) -> tuple[ClassRecall, ...]:
     if windows.y.ndim == 2:
         return ()
-    return class_recalls(windows.y, predicted, windows.recording, new=np.inf)
+    return class_recalls(windows.y, predicted, windows.sources, new=np.inf)
 
 
 def _collapsed(

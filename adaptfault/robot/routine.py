@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from diagnostics import Diagnosis, SensorLayout, Verdict
+from diagnostics.shown import shown
 
 SCHEMA = "adaptfault.routine/1"
 
@@ -89,6 +90,7 @@ class Repertoire:
         return made
 
 
+@shown
 @dataclass(frozen=True)
 class Routine:
     """Recordings to repeat.
@@ -201,6 +203,7 @@ class Routine:
             raise ValueError(f"{path}: {error}") from None
 
 
+@shown
 @dataclass(frozen=True)
 class RoutineResult:
     """What a log of a routine tested.

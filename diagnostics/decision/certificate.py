@@ -7,7 +7,8 @@ confidence c is that of Clopper and Pearson (1934)::
     share of false alarms <= B(c; k + 1, m - k)
 
 B is the quantile of a beta distribution (``scipy.stats.binomtest(k, m).proportion_ci`` one-sided).
-A fit to half of the recordings blames rather more than one to all of them. It is no bound for logs
+Copies of recordings are left out before (:mod:`diagnostics.preprocessing.copies`). A fit to half of
+the recordings blames rather more than one to all of them. It is no bound for logs
 unlike those of the reference: other contacts, another temperature, disturbances.
 """
 

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from diagnostics.shown import shown
+
 if TYPE_CHECKING:
     from diagnostics.layout import SensorLayout
 
@@ -16,6 +18,7 @@ if TYPE_CHECKING:
 _NAMED = 8  # cells of a group that are named: a size
 
 
+@shown
 @dataclass(frozen=True)
 class Coverage:
     """Coverage of a log, in the terms of integrated-circuit testing (Bushnell and Agrawal 2000).

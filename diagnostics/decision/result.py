@@ -18,6 +18,7 @@ from diagnostics.decision.static_loads import StaticLoad
 from diagnostics.faults import Fault, FaultKind, FaultSet
 from diagnostics.layout import SensorLayout
 from diagnostics.preprocessing.transport import TransportFault
+from diagnostics.shown import shown
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -56,6 +57,7 @@ class Verdict(IntEnum):
         return self.name
 
 
+@shown
 @dataclass(frozen=True, eq=False)
 class Diagnosis:
     """The result of a self-diagnosis.

@@ -185,3 +185,26 @@ def test_the_same_seed_gives_the_same_split_and_another_seed_another():
 def test_a_recording_with_two_classes_is_refused():
     with pytest.raises(ValueError, match="recording 5 has windows of two classes"):
         split(Windows(np.zeros((2, 1, 1)), np.array([0, 1]), np.array([5, 5])))
+
+
+def test_a_copy_lies_on_the_side_of_its_recording_in_every_split(grasps):
+    touched = np.flatnonzero(grasps.labels)[:24]  # the first class holds nothing
+    originals = [grasps.frames[i].astype(float) for i in touched]
+    rng = np.random.default_rng(0)
+    step = grasps.layout.full_scale / 1023
+    copies = [
+        np.concatenate([frames[:1], frames[:-1]]) + rng.integers(-1, 2, frames.shape) * step
+        for frames in originals
+    ]
+    labels = np.tile(np.arange(24) % 3, 2)
+    windows = make_windows([*originals, *copies], labels, grasps.layout)
+    assert np.array_equal(windows.sources % 24, windows.recording % 24)
+    assert len(np.unique(windows.sources)) == len(np.unique(windows.independent.recording)) == 24
+    for seed in range(3):
+        sides = [set(part.recording.tolist()) for part in split(windows, seed=seed)]
+        assert sum(map(len, sides)) == 48
+        for side in sides:
+            assert {(number + 24) % 48 for number in side} == side
+    few = make_windows([originals[0], originals[0], originals[1]], [0, 0, 0], grasps.layout)
+    with pytest.raises(ValueError, match=r"class 0 has 2 recordings \(copies count once\)"):
+        split(few)

@@ -77,3 +77,11 @@ def test_a_fit_certifies_itself_and_the_file_keeps_it(tmp_path):
 def test_a_cell_that_is_dead_in_the_reference_is_no_false_alarm():
     dead = [inject(one, [Fault("short", (5,))], LAYOUT) for one in recordings(24)]
     assert SelfDiagnosis(LAYOUT).fit(dead).certificate_.n_alarms == 0
+
+
+@pytest.mark.usefixtures("uncalibrated")
+def test_copies_in_the_reference_make_no_certificate_better():
+    originals = recordings(8)
+    fitted = SelfDiagnosis(LAYOUT).fit([*originals, *(one[1:] for one in originals * 4)])
+    assert fitted.copies_.tolist() == list(range(8)) * 5
+    assert fitted.certificate_ is None  # eight recordings are too few, however often they stand

@@ -2,6 +2,8 @@ from typing import get_args
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from diagnostics import Fault, FaultKind, FaultSet, Line
 from diagnostics.faults import KindName
@@ -60,3 +62,15 @@ def test_a_fault_survives_json():
 
 def test_every_kind_may_be_given_by_its_name():
     assert set(get_args(KindName)) == {str(kind) for kind in FaultKind}
+
+
+@given(st.lists(st.booleans(), min_size=1, max_size=40))
+def test_a_mask_is_taken_as_the_cells_that_it_marks(mask):
+    cells = [i for i, is_faulty in enumerate(mask) if is_faulty]
+    n = len(mask)
+    for form in (mask, np.array(mask), tuple(mask)):
+        assert FaultSet.of(form, n) == FaultSet(form, n) == FaultSet(cells, n)
+    if cells:
+        assert Fault("open", np.array(mask)).cells == tuple(cells)
+    with pytest.raises(ValueError, match=f"mask of {n} cells, expected {n + 1}"):
+        FaultSet.of(mask, n + 1)

@@ -11,8 +11,10 @@ from numpy.typing import NDArray
 
 from adaptfault.data.printable import printable
 from diagnostics import SensorLayout
+from diagnostics.shown import shown
 
 
+@shown
 @dataclass(frozen=True, eq=False)
 class Recordings:
     """Recordings of one array.
@@ -91,6 +93,12 @@ class Recordings:
 
     def __len__(self) -> int:
         return len(self.frames)
+
+    def __str__(self) -> str:
+        lengths = [len(frames) for frames in self.frames]
+        frames = f"{min(lengths, default=0)} to {max(lengths, default=0)} frames"
+        classes = "" if self.labels is None else f", {len(self.class_names)} classes"
+        return f"{len(self)} recordings of {frames}{classes}: {self.layout}"
 
     def __iter__(self) -> Iterator[NDArray[np.float32]]:
         return iter(self.frames)

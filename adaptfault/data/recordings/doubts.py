@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +17,7 @@ from adaptfault.data.recordings.facts.labels import natural_order
 from adaptfault.data.recordings.files import Found
 from adaptfault.data.recordings.survey import Content
 from diagnostics import SensorLayout
+from diagnostics.preprocessing.copies import find_copies
 
 _TOO_HIGH = 0.1  # of the full scale: healthy contacts go further
 _APART = 50.0  # times, between the largest readings of two groups of files
@@ -43,6 +45,23 @@ def doubts(
         None if labelled else _classes_in_names([file for file, _ in files]),
     ]
     return [Problem("warning", text) for text in found if text is not None]
+
+
+def copies(recordings: Sequence[NDArray[Any]], names: Sequence[str]) -> list[Problem]:
+    """Return one warning about recordings that are copies of others: they count once in a fit, in a
+    certificate, and on each side of a split."""
+    of = find_copies(recordings)
+    copied = np.flatnonzero(of != np.arange(len(of)))
+    if not len(copied):
+        return []
+    shown = [f"{names[i]} of {names[of[i]]}" for i in copied[:_SHOWN]]
+    more = f" and {len(copied) - _SHOWN} more" if len(copied) > _SHOWN else ""
+    are = "recording is a copy" if len(copied) == 1 else "recordings are copies"
+    what = (
+        f"{len(copied)} of {len(of)} {are}, exact or nearly: {', '.join(shown)}{more}; they count"
+        " once in a reference, in training and in tests"
+    )
+    return [Problem("warning", what)]
 
 
 def _two_scales(contents: Sequence[Content]) -> str | None:

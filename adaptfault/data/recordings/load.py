@@ -25,7 +25,7 @@ from adaptfault.data.recordings.check import (
     without_infinite,
 )
 from adaptfault.data.recordings.dataset import Recordings
-from adaptfault.data.recordings.doubts import doubts
+from adaptfault.data.recordings.doubts import copies, doubts
 from adaptfault.data.recordings.errors import InputError, Problem, located
 from adaptfault.data.recordings.facts.classes import class_indices, label_files
 from adaptfault.data.recordings.facts.infer import PAPER, SLACK
@@ -44,6 +44,7 @@ from adaptfault.data.recordings.readers import check_stated, readers
 from adaptfault.data.recordings.recording import BLOCK, Recording
 from adaptfault.data.recordings.survey import Content, Surveyor
 from diagnostics import SensorLayout
+from diagnostics.shown import shown
 
 if TYPE_CHECKING:
     from adaptfault.data.calibration import Calibration
@@ -62,6 +63,7 @@ def _nothing(done: int) -> None:
     """Nobody looks at the progress."""
 
 
+@shown
 @dataclass(frozen=True, eq=False)
 class Loaded:
     """The recordings that could be read, and the problems.
@@ -77,6 +79,9 @@ class Loaded:
     recordings: Recordings
     problems: tuple[Problem, ...] = ()
     inferred: tuple[str, ...] = ()
+
+    def __str__(self) -> str:
+        return "\n".join([str(self.recordings), *map(str, self.problems), *self.inferred])
 
 
 class Opened:
@@ -309,7 +314,8 @@ def load(
         opened.value_names,
     )
     scale = check_scale(given[0], recordings, opened.layout) if strict else []
-    problems = (*opened.problems, *opened.late_problems, *scale)
+    told = copies(recordings.frames, recordings.names)
+    problems = (*opened.problems, *opened.late_problems, *scale, *told)
     return Loaded(recordings, problems, opened.inferred)
 
 

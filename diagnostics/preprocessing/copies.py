@@ -1,0 +1,168 @@
+"""Recordings that are copies of others count once: they hold no new observation.
+
+A copy has the readings of another recording, with noise of a step of the converter, cut at its
+ends, or shifted by some frames. The frame of largest load and others are looked up among all
+frames, by 8 random projections in a k-d tree. Where one is found again, the recordings are laid on
+each other there and compared: in a copy, the cells that move differ by a small share of how they
+move. Two recordings of one motion differ by more, as noise and contact are new.
+
+Recordings in which nothing moves are no copies: healthy cells at rest read the same every time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+_PROJECTIONS = 8
+_LOOKED_UP = 8  # frames of a recording
+_FOUND = 24  # places at most, for each of them
+_PLACED = 3  # ways in which two recordings are laid on each other, at most
+_TOLERANCE = 1e-3  # of the range of all readings
+_LOADED = 8.0  # tolerances away from rest: readings that two recordings do not share by chance
+_AGREE = 0.9  # share of the loaded readings of a frame that agree in a copy
+# standard deviation of the difference, of that of the readings: at most in a copy
+_DIFFERS = 0.2
+_DIFFERS_SHORT = 0.1  # in fewer frames than that: short recordings are like each other by chance
+_SHORT = 30
+_FEWEST = 64  # loaded readings, in so many frames at least:
+_FRAMES = 4
+_OVERLAP = 0.5  # of the shorter recording
+
+Floats = NDArray[np.floating[Any]]
+
+
+def find_copies(recordings: Sequence[Floats]) -> NDArray[np.intp]:
+    """Return for each recording the longest one that it is a copy of, or itself, int ``[n]``.
+
+    Args:
+        recordings: ``[T, D]`` each; NaN = missing.
+    """
+    n = len(recordings)
+    own = np.arange(n)
+    kept = [i for i in own if len(recordings[i]) >= _FRAMES]
+    if len(kept) < 2:
+        return own
+    loads = [np.empty((0, 0), np.float32) for _ in own]
+    rest = _rest([recordings[i] for i in kept])
+    for i in kept:
+        loads[i] = np.nan_to_num(recordings[i] - rest, posinf=0, neginf=0).astype(np.float32)
+    tolerance = _tolerance([loads[i] for i in kept])
+    pairs = _pairs(loads, kept, tolerance)
+    links = [(i, j) for i, j, shift in pairs if _same(loads[i], loads[j], shift, tolerance)]
+    links += _identical([loads[i] for i in kept], kept)
+    if not links:
+        return own
+    ones = np.ones(len(links))
+    graph = coo_array((ones, np.array(links).T), shape=(n, n))
+    _, group = connected_components(graph, directed=False)
+    lengths = np.array([len(one) for one in recordings])
+    order = np.lexsort((own, -lengths))  # the longest first, the first of equal ones
+    _, first = np.unique(group[order], return_index=True)
+    return np.asarray(order[first][group], np.intp)
+
+
+def _tolerance(loads: Sequence[NDArray[np.float32]]) -> float:
+    """Return by how much a reading of a copy differs: a share of the range, or the step of the
+    converter."""
+    some = np.concatenate([one[:: max(1, len(one) // 16)].ravel() for one in loads])
+    values = np.unique(some)
+    if len(values) < 2:
+        return 1.0  # nothing moves, whatever the tolerance
+    low, high = np.quantile(some, (0.001, 0.999))
+    few = len(values) < 0.1 * len(some)  # of decimal numbers no two are equal
+    step = float(np.median(np.diff(values))) if few else 0.0
+    return max(_TOLERANCE * float(high - low), step, 1e-12)
+
+
+def _rest(recordings: Sequence[Floats]) -> NDArray[np.float64]:
+    """Return the median reading of each cell, ``[D]``, over some frames of all recordings."""
+    some = [one[:: max(1, len(one) // 16)] for one in recordings]
+    frames = np.concatenate(some).astype(np.float64)
+    frames[~np.isfinite(frames)] = np.nan
+    unread = np.isnan(frames).all(axis=0)
+    frames[:, unread] = 0.0
+    return np.asarray(np.nanmedian(frames, axis=0))
+
+
+def _identical(loads: Sequence[NDArray[np.float32]], kept: Sequence[int]) -> list[tuple[int, int]]:
+    """Return each recording that moves with an earlier one that has the same readings."""
+    first: dict[bytes, int] = {}
+    links = []
+    for load, i in zip(loads, kept, strict=True):
+        if (load != load[:1]).any():
+            links.append((i, first.setdefault(load.tobytes(), i)))
+    return links
+
+
+def _pairs(
+    loads: Sequence[NDArray[np.float32]], kept: Sequence[int], tolerance: float
+) -> list[tuple[int, int, int]]:
+    """Return (i, j, shift) where a frame t of recording i reads nearly as frame t + shift of j."""
+    width = loads[kept[0]].shape[1]
+    rng = np.random.default_rng(0)
+    directions = rng.choice([-1.0, 1.0], (width, _PROJECTIONS)) / np.sqrt(width)
+    projected = [loads[i] @ directions.astype(np.float32) for i in kept]
+    owner = np.repeat(np.arange(len(kept)), [len(one) for one in projected])
+    place = np.concatenate([np.arange(len(one)) for one in projected])
+    tree = cKDTree(np.concatenate(projected))
+    found: dict[tuple[int, int], set[int]] = {}
+    for k, i in enumerate(kept):
+        frames = _looked_up(loads[i], tolerance)
+        if not len(frames):
+            continue
+        near = 4 * tolerance * np.sqrt(_PROJECTIONS)
+        _, at = tree.query(
+            projected[k][frames], k=min(_FOUND, len(owner)), distance_upper_bound=near
+        )
+        for t, places in zip(frames.tolist(), at.reshape(len(frames), -1), strict=True):
+            for hit in places[places < len(owner)].tolist():
+                j = kept[owner[hit]]
+                shifts = found.setdefault((i, j), set())
+                if j == i or len(shifts) == _PLACED:
+                    continue
+                if _agree(loads[i][t], loads[j][place[hit]], tolerance):
+                    shifts.add(int(place[hit]) - t)
+    return [(i, j, shift) for (i, j), shifts in found.items() for shift in sorted(shifts)]
+
+
+def _looked_up(load: NDArray[np.float32], tolerance: float) -> NDArray[np.intp]:
+    """Return some loaded frames, the one of largest load and others evenly over the rest."""
+    total = np.abs(load).sum(axis=1)
+    loaded = np.flatnonzero((np.abs(load) > _LOADED * tolerance).any(axis=1))
+    if not len(loaded):
+        return loaded
+    evenly = loaded[np.linspace(0, len(loaded) - 1, _LOOKED_UP).astype(np.intp)]
+    return np.unique([*evenly, int(total.argmax())])
+
+
+def _same(
+    one: NDArray[np.float32], other: NDArray[np.float32], shift: int, tolerance: float
+) -> bool:
+    """Return whether frame t of ``one`` reads as frame t + ``shift`` of the other."""
+    begin = max(0, -shift)
+    end = min(len(one), len(other) - shift)
+    if end - begin < _OVERLAP * min(len(one), len(other)):
+        return False
+    a = one[begin:end]
+    b = other[begin + shift : end + shift]
+    moving = np.maximum(np.ptp(a, axis=0), np.ptp(b, axis=0)) > _LOADED * tolerance
+    loaded = np.maximum(np.abs(a), np.abs(b))[:, moving] > _LOADED * tolerance
+    if loaded.sum() < _FEWEST or loaded.any(axis=1).sum() < _FRAMES:
+        return False
+    usual = float(np.var(a[:, moving], axis=0).sum())
+    difference = float(np.square(a - b)[:, moving].mean(axis=0).sum())
+    most = _DIFFERS_SHORT if end - begin < _SHORT else _DIFFERS
+    return difference <= most**2 * usual
+
+
+def _agree(a: NDArray[np.float32], b: NDArray[np.float32], tolerance: float) -> bool:
+    """Return whether the readings of two frames that are away from rest in one are the same."""
+    loaded = np.maximum(np.abs(a), np.abs(b)) > _LOADED * tolerance
+    return bool(loaded.any()) and bool((np.abs(a - b)[loaded] <= 4 * tolerance).mean() >= _AGREE)

@@ -12,9 +12,9 @@ T = TypeVar("T", bound=type[Any])
 
 def shown(cls: T) -> T:
     """Give a class, which has a text, a ``repr`` of one line and a page of HTML for notebooks."""
-    if cls.__str__ is object.__str__:
-        raise TypeError(f"{cls.__name__} has no text to show")
     result: Any = cls
+    if result.__str__ is object.__str__:
+        raise TypeError(f"{cls.__name__} has no text to show")
     result.__repr__ = _line
     result._repr_html_ = _page
     return cls

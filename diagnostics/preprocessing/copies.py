@@ -46,7 +46,7 @@ def find_copies(recordings: Sequence[Floats]) -> NDArray[np.intp]:
     """
     n = len(recordings)
     own = np.arange(n)
-    kept = [i for i in own if len(recordings[i]) >= _FRAMES]
+    kept = [i for i in range(n) if len(recordings[i]) >= _FRAMES]
     if len(kept) < 2:
         return own
     loads = [np.empty((0, 0), np.float32) for _ in own]

@@ -10,12 +10,11 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 SHORTEST = 10
 """Frames of a window: a class that mostly holds for as many is that of a recording."""
@@ -27,14 +26,23 @@ class Episode:
 
     Attributes:
         first, last: its first frame, and the one behind its last.
-        name: "episode 3"; None where no number is given.
+        number: how the file numbers it; None: it does not.
         label: its class; None without one.
+        part: which stretch of one class it is; None: the whole episode.
     """
 
     first: int
     last: int
-    name: str | None = None
+    number: Any = None
     label: str | None = None
+    part: int | None = None
+
+    @property
+    def name(self) -> str | None:
+        """How it is called: "episode 3"; None where it has no number."""
+        if self.number is None:
+            return None
+        return f"episode {self.number}" + ("" if self.part is None else f", part {self.part}")
 
 
 @dataclass(frozen=True)
@@ -52,72 +60,54 @@ class Division:
     lost: str = ""
 
 
-def divide(
-    frames: int, numbers: Sequence[Any] | None = None, classes: Sequence[Any] | None = None
-) -> Division:
+def numbered(numbers: Sequence[Any]) -> list[Episode]:
+    """Return the episodes of frames with the number of theirs."""
+    begins = [0, *(i for i in range(1, len(numbers)) if numbers[i] != numbers[i - 1])]
+    return [Episode(a, b, numbers[a]) for a, b in pairwise([*begins, len(numbers)])]
+
+
+def divide(episodes: Sequence[Episode], classes: Sequence[Any]) -> Division:
     """Return the recordings of a file.
 
     Args:
-        frames: in it.
-        numbers: of the episode of each frame.
+        episodes: in it.
         classes: of each frame; None and "" are none, and the frame has that of the one before it.
     """
-    begins = _changes(numbers, 0, frames)
-    parts = list(pairwise([*begins, frames]))
-    names = [None if numbers is None else f"episode {numbers[first]}" for first, _ in parts]
-    if classes is None:
-        every = [Episode(*part, name) for part, name in zip(parts, names, strict=True)]
-        return Division(tuple(every))
-    held = [_filled(classes[first:last]) for first, last in parts]
-    stretches = []
+    stretches: list[list[Episode]] = []
     lengths: list[int] = []
-    changes = 0
-    for labels, (first, last) in zip(held, parts, strict=True):
-        of_it = _changes(labels, first, last)
-        stretches.append(of_it)
-        changes += len(of_it) - 1
-        if len(of_it) > 1:
-            lengths += np.diff([*of_it, last]).tolist()
-    if lengths and np.median(lengths) >= SHORTEST:
-        return _by_class(parts, names, held, stretches)
-    episodes = []
+    usual: list[Episode] = []
     lost = 0
-    for (first, last), name, labels in zip(parts, names, held, strict=True):
-        label = _most(labels)
-        lost += sum(one not in (label, None) for one in labels)
-        episodes.append(Episode(first, last, name, label))
+    for episode in episodes:
+        labels = _filled(classes[episode.first : episode.last])
+        counts = Counter(label for label in labels if label is not None)
+        label = max(sorted(counts), key=counts.__getitem__, default=None)
+        lost += len(labels) - labels.count(label)
+        usual.append(replace(episode, label=label))
+        parts = [
+            replace(
+                episode,
+                first=episode.first + one.first,
+                last=episode.first + one.last,
+                label=one.number,
+                part=place,
+            )
+            for place, one in enumerate(numbered(labels))
+        ]
+        stretches.append(parts if len(parts) > 1 else usual[-1:])
+        if len(parts) > 1:
+            lengths += [part.last - part.first for part in parts]
+    if not lost:
+        return Division(tuple(usual))
+    if np.median(lengths) >= SHORTEST:
+        found = tuple(part for parts in stretches for part in parts)
+        return Division(found, f"a recording begins where the class changes, {len(found)} in all")
+    changes = sum(len(parts) - 1 for parts in stretches)
     told = (
         f"the class changes {changes} time{'s' * (changes != 1)} within a recording, which has its"
-        f" most frequent one: that of {lost} of {frames} frames is lost; cut the recordings where"
-        " it changes"
+        f" most frequent one: that of {lost} of {len(classes)} frames is lost; cut the recordings"
+        " where it changes"
     )
-    return Division(tuple(episodes), lost=told if lost else "")
-
-
-def _by_class(
-    parts: Sequence[tuple[int, int]],
-    names: Sequence[str | None],
-    held: Sequence[list[str | None]],
-    stretches: Sequence[list[int]],
-) -> Division:
-    episodes = []
-    for (first, last), name, labels, begins in zip(parts, names, held, stretches, strict=True):
-        for k, (begin, end) in enumerate(pairwise([*begins, last])):
-            called = name if name is None or len(begins) == 1 else f"{name}, part {k}"
-            episodes.append(Episode(begin, end, called, labels[begin - first]))
-    told = f"a recording begins where the class changes, {len(episodes)} in all"
-    return Division(tuple(episodes), told)
-
-
-def _changes(values: Sequence[Any] | None, first: int, last: int) -> list[int]:
-    """Return ``first``, and each frame before ``last`` whose value is another than the one before
-    it; the values are those from ``first`` on."""
-    if values is None or last - first < 2:
-        return [first]
-    held: NDArray[Any] = np.empty(last - first, dtype=object)
-    held[:] = list(values)
-    changed = np.flatnonzero(held[1:] != held[:-1]) + 1
-    return [first, *(changed + first).tolist()]
+    return Division(tuple(usual), lost=told)
 
 
 def _filled(classes: Sequence[Any]) -> list[str | None]:
@@ -130,9 +120,3 @@ def _filled(classes: Sequence[Any]) -> list[str | None]:
         known = text or known
         filled.append(known)
     return filled
-
-
-def _most(labels: Sequence[str | None]) -> str | None:
-    """Return the most frequent class."""
-    counts = Counter(label for label in labels if label is not None)
-    return max(sorted(counts), key=counts.__getitem__, default=None)

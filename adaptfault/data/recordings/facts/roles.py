@@ -6,7 +6,9 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Sequence
 from itertools import product
+from pathlib import Path
 
+from adaptfault.data.recordings.errors import InputError
 from adaptfault.data.recordings.recording import Shape
 
 EPISODES = ("episode_index", "episode", "episode_id", "recording", "trial")
@@ -39,6 +41,12 @@ _OF_DEVICE = re.compile(rf"(?:\w+[_ ])(?:{_WORDS})(?:[_ ]?{_UNIT})?", re.IGNOREC
 
 _ENDS_IN_UNIT = re.compile(rf"[_ ]{_UNIT}", re.IGNORECASE | re.ASCII)
 
+_SINCE = re.compile(
+    r"(?:(s|sec|secs|seconds?)|(ms|msecs?|milliseconds?)|(us|microseconds?)|(ns|nanoseconds?))"
+    r"(?: since .*)?",
+    re.IGNORECASE,
+)
+
 _COUNTER = re.compile(
     r"|unnamed: 0|index|sn|seq(?:uence)?|counter"
     r"|(?:frame|sample|packet|row|line)(?:[_ ]?(?:id|no|nr|number|count|counter))?",
@@ -46,12 +54,13 @@ _COUNTER = re.compile(
 )
 """Names of what counts the frames, where they stand before the readings."""
 
-_COUNTERS = ("frame_index", "frame_id", "sample_index", "task_index")
+COUNTERS = ("frame_index", "frame_id", "sample_index", "task_index")
 """Names of it wherever they stand."""
 
 _STATUS = re.compile(r"(?:.*_)?(?:flags?|status|state|valid|checksum|crc(?:8|16|32)?)", re.I)
 """Names of what accompanies readings."""
 
+_SHOWN = 12  # columns in a message
 _DIGITS = re.compile(r"\d+")
 
 
@@ -60,17 +69,20 @@ def _last(name: str) -> str:
     return re.split(r"[./]", name.strip())[-1]
 
 
-def unit_of(name: str) -> str | None:
-    """Return the unit in the name of times, as in ``elapsed_ms``; None: it states none."""
+def unit_of(name: str, units: object = None) -> str | None:
+    """Return the unit of times: what their attribute ``units`` says, as "milliseconds since
+    2020-01-01", or the end of their name, as in ``elapsed_ms``; None: nothing states it."""
+    stated = _SINCE.fullmatch(units.strip()) if isinstance(units, str) else None
+    if stated is not None:
+        return ("s", "ms", "us", "ns")[(stated.lastindex or 1) - 1]
     last = _last(name)
     found = _CLOCK.fullmatch(last) or _OF_DEVICE.fullmatch(last)
     if found is not None:
         return None if found[1] is None else _UNITS[found[1].lower()]
     if last.lower() in _ALONE:
         return _UNITS[last.lower()]
-    ends = [*_ENDS_IN_UNIT.finditer(last)]
-    at_end = [one for one in ends if one.end() == len(last)]
-    return _UNITS[at_end[0][1].lower()] if at_end else None
+    ends = [one for one in _ENDS_IN_UNIT.finditer(last) if one.end() == len(last)]
+    return _UNITS[ends[0][1].lower()] if ends else None
 
 
 def is_clock(name: str) -> bool:
@@ -93,6 +105,24 @@ def first_of(wanted: Sequence[str], names: Sequence[str]) -> str | None:
     return next((names[lower.index(name)] for name in wanted if name in lower), None)
 
 
+def named(path: Path, option: str, stated: str | None, columns: Sequence[str]) -> str | None:
+    """Return the column that an option states, by its name or the last part of it; None where it
+    states none.
+
+    Raises:
+        InputError: no column has this name, or several have.
+    """
+    if stated is None:
+        return None
+    found = [name for name in columns if name == stated]
+    found = found or [name for name in columns if re.split(r"[./]", name)[-1] == stated]
+    if len(found) == 1:
+        return found[0]
+    held = ", ".join([*columns[:_SHOWN], *(["..."] if len(columns) > _SHOWN else [])])
+    count = "several have this name" if found else "there is none"
+    raise InputError.at(path, f"--{option} {stated}: {count}; name one of {held}")
+
+
 def no_readings(names: Sequence[str]) -> list[int]:
     """Return which of the columns with some names hold times, episodes, classes or numbers of
     frames."""
@@ -100,7 +130,7 @@ def no_readings(names: Sequence[str]) -> list[int]:
     leads = True
     for column, name in enumerate(names):
         plain = name.strip().lower()
-        is_aside = is_clock(plain) or plain in (*EPISODES, *LABELS, *_COUNTERS)
+        is_aside = is_clock(plain) or plain in (*EPISODES, *LABELS, *COUNTERS)
         if is_aside or (leads and _COUNTER.fullmatch(plain)):
             found.append(column)
             continue
@@ -137,6 +167,24 @@ def readings(names: Sequence[str], cells: int | None = None) -> list[int]:
         return every
     touch = [column for stem in found if TOUCH.search(stem) for column in found[stem]]
     return sorted(touch) if touch and len(kept) != cells else kept
+
+
+def by_family(names: Sequence[str], columns: Sequence[str]) -> list[str]:
+    """Return names in the order in which their families begin among the ``columns`` of a file; the
+    order within a family stays."""
+    stems = [_DIGITS.sub("*", column) for column in columns]
+    return sorted(names, key=lambda name: stems.index(_DIGITS.sub("*", name)))
+
+
+def left_out(others: Sequence[str], kept: Sequence[str], option: str) -> str:
+    """Return the sentence that columns are taken for no readings; "" where there are none."""
+    if not others:
+        return ""
+    more = f", ... ({len(others)} in all)" if len(others) > _SHOWN else ""
+    kinds = ", ".join(families(kept))
+    beside = f" beside {kinds}" if kinds else ""
+    what = f"{', '.join(others[:_SHOWN])}{more} left out, as no reading{beside}"
+    return f"{what}; otherwise give --{option}"
 
 
 def shape_of(names: Sequence[str]) -> tuple[Shape, str] | None:

@@ -18,9 +18,9 @@ from adaptfault.data.recordings.facts.roles import (
     EPISODES,
     LABELS,
     clock_of,
-    families,
     first_of,
     is_clock,
+    left_out,
     no_readings,
     shape_of,
     unit_of,
@@ -202,13 +202,8 @@ def _numbered(
     cells = None if shape is None else math.prod(shape)
     kept = [columns[i] for i in readings_of([names[i] for i in columns], cells)]
     others = [names[i] or str(i) for i in columns if i not in kept]
-    if not others:
-        return kept, ()
-    more = f", ... ({len(others)} in all)" if len(others) > _LISTED else ""
-    kinds = ", ".join(families([names[i] for i in kept]))
-    beside = f" beside {kinds}" if kinds else ""
-    what = f"{', '.join(others[:_LISTED])}{more} left out, as no reading{beside}"
-    return kept, (f"{what}; otherwise give --columns",)
+    told = left_out(others, [names[i] for i in kept], "columns")
+    return kept, ((told,) if told else ())
 
 
 class _Named:

@@ -10,7 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from adaptfault.data.recordings.errors import InputError
-from adaptfault.data.recordings.facts.episodes import Division, divide
+from adaptfault.data.recordings.facts.episodes import Division, Episode, divide
+from adaptfault.data.recordings.facts.episodes import numbered as by_number
 from adaptfault.data.recordings.formats.columns import Columns
 from adaptfault.data.recordings.formats.dialect import Dialect, bare, is_comment, unquoted
 from adaptfault.data.recordings.formats.text import LATIN
@@ -45,7 +46,7 @@ def spans_of(path: Path, dialect: Dialect, columns: Columns) -> tuple[list[Span]
         InputError: the column of classes is empty.
     """
     if columns.episode is None and columns.label is None:
-        return [Span()], divide(0)
+        return [Span()], Division(())
     places: list[tuple[int, int]] = []
     numbers: list[str] = []
     classes: list[str] = []
@@ -58,7 +59,8 @@ def spans_of(path: Path, dialect: Dialect, columns: Columns) -> tuple[list[Span]
     if columns.label is not None and not any(classes):
         what = f"column {columns.label} is empty; --label-column names the class"
         raise InputError.at(path, what)
-    division = divide(len(places), numbers or None, classes or None)
+    episodes = by_number(numbers) if numbers else [Episode(0, len(places))]
+    division = divide(episodes, classes) if classes else Division(tuple(episodes))
     begins = [places[episode.first] for episode in division.episodes]
     ends = [*(begin for _, begin in begins[1:]), None]
     begins[0] = (0, 0)

@@ -16,8 +16,8 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
@@ -27,10 +27,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adaptfault.data.recordings.errors import NO_FRAMES, InputError, Problem, located
+from adaptfault.data.recordings.facts.episodes import Division, Episode, divide, numbered
 from adaptfault.data.recordings.facts.labels import natural_key
+from adaptfault.data.recordings.facts.roles import (
+    COUNTERS,
+    EPISODES,
+    LABELS,
+    by_family,
+    is_clock,
+    left_out,
+    shape_of,
+    unit_of,
+)
 from adaptfault.data.recordings.formats.datasets.axes import TURNED, TimeLast, Vector, is_time_last
 from adaptfault.data.recordings.formats.datasets.contents import (
-    CLASSES,
     FULL_SCALES,
     NUMBERS,
     RATES,
@@ -52,8 +62,6 @@ from adaptfault.data.recordings.formats.datasets.features import (
     is_touch,
     shown,
 )
-from adaptfault.data.recordings.formats.datasets.table import CLOCK, EPISODES, unit_of
-from adaptfault.data.recordings.formats.datasets.table import NUMBERS as NUMBERED
 from adaptfault.data.recordings.recording import BLOCK, Block, Facts, Recording, Shape
 
 _ENDS = ("episode_ends", "lengths", "episode_lengths")
@@ -193,12 +201,14 @@ class _Chooser:
         self.ends = next((name for name in arrays if last_part(name) in _ENDS), None)
         self.outer = False
         self.is_turned = False
-        aside = (*EPISODES, *CLASSES, *_given(stated))
+        aside = (*EPISODES, *LABELS, *_given(stated))
         self._beside: dict[str, list[str]] = {}
         for name in arrays:
-            if last_part(name) in aside or CLOCK.fullmatch(last_part(name)):
+            if last_part(name) in aside or is_clock(last_part(name)):
                 self._beside.setdefault(name.rpartition("/")[0], []).append(name)
         self._texts: dict[str, list[str]] = {}
+        self.divisions: list[Division] = []
+        self.left_out = ""
 
     # readings
 
@@ -217,6 +227,11 @@ class _Chooser:
         except InputError:
             self._refuse_left_out(key)
             raise
+        if key is None and chosen and not any(features.get(name) for name in chosen):
+            others = [name for name in features if name not in chosen and not features[name]]
+            in_file = by_episode(list(listed)).values()
+            chosen = by_family(chosen, [name for names in in_file for name in names])
+            self.left_out = left_out(others, chosen, "key")
         found = [
             (episode, [names[common] for common in chosen])
             for episode, names in grouped.items()
@@ -242,8 +257,8 @@ class _Chooser:
         if array.dtype.kind not in NUMBERS or name == self.ends:
             return False
         if len(array.shape) == 1:
-            aside = (*EPISODES, *NUMBERED, *CLASSES, *_given(self.stated))
-            return last not in aside and not CLOCK.fullmatch(last)
+            aside = (*EPISODES, *COUNTERS, "index", *LABELS, *_given(self.stated))
+            return last not in aside and not is_clock(last)
         return last not in _given(self.stated)
 
     def _refuse_left_out(self, key: str | None) -> None:
@@ -326,16 +341,22 @@ class _Chooser:
         unit = contents.attribute(name, UNITS)
         packings = self.readings(part).packings
         whole = all(contents.arrays[one].dtype.kind in "iu" for one in part.names)
+        by_name = None  # where each array is a cell
+        if self.shape is None and len(part.names) > 1 and not any(map(self._sizes, part.names)):
+            by_name = shape_of(part.names)
+        told = [self.left_out, *(division.inferred for division in self.divisions)]
         return Facts(
             self.path,
             counts=whole and not any(one.is_scaled for one in packings),
-            shape=pads.shape,
+            shape=pads.shape if by_name is None else by_name[0],
+            shape_reason="" if by_name is None else by_name[1],
             present=pads.present,
             full_scale=contents.positive(name, FULL_SCALES),
             unit=unit if isinstance(unit, str) and 0 < len(unit) <= _LONGEST_UNIT else None,
             rate=None if rate is None else rate * pads.steps,
             stored=tuple(map(int, contents.arrays[name].shape)),
             problems=tuple(self._told(part, pads)),
+            inferred=tuple(dict.fromkeys(filter(None, told))),
             sizes=pads.sizes,
             places=pads.places,
         )
@@ -347,6 +368,7 @@ class _Chooser:
             told.append(TURNED.format(part.names[0]))
         if pads.is_guessed:
             told.append(f"{', '.join(part.names)}: {GUESSED}")
+        told += [division.lost for division in self.divisions if division.lost]
         left_out = list(self.contents.left_out.items())
         told += [f"{name} is left out: it {why}" for name, why in left_out[:_SHOWN]]
         if len(left_out) > _SHOWN:
@@ -361,24 +383,31 @@ class _Chooser:
         for place, (group, names) in enumerate(episodes):
             length = min(self._length(name) for name in names)
             clock = self._clock(names[0], length)
-            label = self._classes(names[0])
+            classes = self._classes(names[0])
             start = partial(_Part, tuple(names), clock=clock, group=group)
             if self.outer:
                 frames = int(self.contents.arrays[names[0]].shape[1])
                 for i in range(length):
-                    yield start(0, frames, outer=i, clock=None, label=label(0, frames, i, length))
+                    label = classes.of_recording(i, length)
+                    yield start(0, frames, outer=i, clock=None, label=label)
                 continue
             column = self._episode_column(names[0], length)
             if self.ends is not None:
-                bounds = self._bounds(self.ends, length)
+                found = self._bounds(self.ends, length)
             elif column is not None and not group:
-                bounds = self._runs(column)
+                found = self._runs(column)
             else:
-                yield start(0, length, label=label(0, length, place, len(episodes)))
-                continue
-            for i, (number, first, last) in enumerate(bounds):
-                named = label(first, last, i, len(bounds))
-                yield start(first, last, label=named, number=number)
+                found = [Episode(0, length)]
+            is_group = len(found) == 1 and found[0].number is None
+            first = place if is_group else 0
+            count = len(episodes) if is_group else len(found)
+            division = classes.divided(found, first, count)
+            self.divisions.append(division)
+            for episode in division.episodes:
+                number = episode.number
+                if episode.part is not None and number is not None:
+                    number = f"{number}, part {episode.part}"
+                yield start(episode.first, episode.last, label=episode.label, number=number)
 
     def _episode_column(self, name: str, length: int) -> str | None:
         """Return the array that numbers the episode of each row of a table; None without one.
@@ -393,8 +422,8 @@ class _Chooser:
             raise InputError.at(self.path, what)
         return column
 
-    def _bounds(self, name: str, length: int) -> list[tuple[int | str, int, int]]:
-        """Return number, first frame and the one behind the last of each episode."""
+    def _bounds(self, name: str, length: int) -> list[Episode]:
+        """Return the episodes whose ends an array tells."""
         stored = np.asarray(self.contents.arrays[name][:]).ravel()
         if stored.dtype.kind not in "iu":
             what = f"{name} holds no whole numbers; it holds where each episode ends"
@@ -408,20 +437,17 @@ class _Chooser:
             what = f"{name} ends at frame {ends[-1]}, but the readings hold {length}: cut off?"
             raise InputError.at(self.path, what)
         bounds = enumerate(pairwise([0, *ends.tolist()]))
-        return [(number, first, last) for number, (first, last) in bounds]
+        return [Episode(first, last, number) for number, (first, last) in bounds]
 
-    def _runs(self, name: str) -> list[tuple[int | str, int, int]]:
-        """Return the value of a column that numbers the episodes, and the rows in which it holds
-        it, as :meth:`_bounds`."""
+    def _runs(self, name: str) -> list[Episode]:
+        """Return the episodes that a column numbers."""
         array = self.contents.arrays[name]
         stored = np.asarray(array[:]).ravel()
         if array.dtype.kind in TEXTS:
             stored = np.array(texts(stored))
         if stored.dtype.kind == "f" and not np.isfinite(stored).all():
             raise InputError.at(self.path, f"rows without {name}; leave them out")
-        begins = np.flatnonzero(stored[1:] != stored[:-1]) + 1
-        bounds = pairwise([0, *begins.tolist(), len(stored)] if len(stored) else [])
-        return [(_plain_number(stored[first]), first, last) for first, last in bounds]
+        return numbered([_plain_number(value) for value in stored]) if len(stored) else []
 
     # times and classes
 
@@ -455,7 +481,7 @@ class _Chooser:
         near = [one for group in self._groups(name) for one in self._beside.get(group, [])]
         for other in near if stated is None else [*near, stated]:
             if stated is None:
-                is_meant = CLOCK.fullmatch(last_part(other)) is not None
+                is_meant = is_clock(last_part(other))
             else:
                 is_meant = f"/{other.lower()}".endswith(f"/{stated.lower()}")
             if is_meant and other in arrays and _is_vector(arrays[other], length):
@@ -469,37 +495,70 @@ class _Chooser:
         told = f"--{option} {name}: holds no such array{what}; it holds {held}"
         return InputError.at(self.path, told)
 
-    def _classes(self, name: str) -> Callable[[int, int, int, int], str | None]:
-        """Return what tells the class of the recording with some first and last frame, its number
-        and how many there are."""
+    def _classes(self, name: str) -> _Classes:
+        """Return the classes of recordings, or of frames, beside an array of readings."""
         stated = self.stated.label
-        wanted = CLASSES if stated is None else (last_part(stated),)
+        wanted = LABELS if stated is None else (last_part(stated),)
         value = self.contents.attribute(name, wanted)
         if value is not None:
-            return lambda *_: str(value)
+            return _Classes(self.path, stated, common=str(value))
         holder = self._near(name, wanted)
         if stated is not None and (holder is None or stated in self.contents.arrays):
             holder = stated
         if holder is None:
-            return lambda *_: None
+            return _Classes(self.path, stated)
         if holder not in self.contents.arrays:
             raise self._absent("label-column", str(stated), " or attribute")
         if holder not in self._texts:
             self._texts[holder] = texts(self.contents.arrays[holder][:])
-        return partial(self._class_of, holder, self._texts[holder])
+        return _Classes(self.path, stated, holder, self._texts[holder])
 
-    def _class_of(
-        self, holder: str, values: Sequence[str], first: int, last: int, number: int, count: int
-    ) -> str | None:
-        if len(values) == count:
-            return values[number] or None
-        if len(values) >= last:
-            counts = Counter(value for value in values[first:last] if value)
-            return max(sorted(counts), key=counts.__getitem__, default=None)
-        if self.stated.label is None:
+
+@dataclass(frozen=True)
+class _Classes:
+    """The classes beside an array of readings.
+
+    Attributes:
+        path: of the file.
+        stated: the option of the user.
+        holder: the array that holds them.
+        values: one a recording, or one a frame.
+        common: the class of all.
+    """
+
+    path: Path
+    stated: str | None
+    holder: str = ""
+    values: Sequence[str] | None = None
+    common: str | None = None
+
+    def of_recording(self, place: int, count: int) -> str | None:
+        """Return the class of one of ``count`` recordings."""
+        if self.values is None:
+            return self.common
+        if len(self.values) == count:
+            return self.values[place] or None
+        if self.stated is None:
             return None
-        what = f"{holder} holds {len(values)} classes; expected one a recording, or one a frame"
-        raise InputError.at(self.path, f"--label-column {self.stated.label}: {what}")
+        what = f"{self.holder} holds {len(self.values)} classes"
+        what += "; expected one a recording, or one a frame"
+        raise InputError.at(self.path, f"--label-column {self.stated}: {what}")
+
+    def divided(self, episodes: Sequence[Episode], first: int, count: int) -> Division:
+        """Return episodes with their classes, divided where these change.
+
+        Args:
+            episodes: in their order.
+            first: place of the first of them.
+            count: of all episodes of the file.
+        """
+        frames = max((episode.last for episode in episodes), default=0)
+        if self.values is not None and len(self.values) != count and len(self.values) >= frames:
+            return divide(episodes, self.values[:frames])
+        places = range(first, first + len(episodes))
+        labels = [self.of_recording(place, count) for place in places]
+        each = zip(episodes, labels, strict=True)
+        return Division(tuple(replace(episode, label=label) for episode, label in each))
 
 
 def _given(stated: Stated) -> list[str]:

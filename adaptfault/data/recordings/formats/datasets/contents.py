@@ -18,6 +18,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from adaptfault.data.recordings.facts.roles import LABELS
 from adaptfault.data.recordings.formats.datasets.features import is_touch
 
 NUMBERS = "iuf"
@@ -28,10 +29,9 @@ TEXTS = "OSUT"
 RATES = ("rate", "fps", "hz", "sampling_rate", "sampling_hz", "frequency")
 FULL_SCALES = ("full_scale", "max_value")
 UNITS = ("unit", "units")
-CLASSES = ("label", "labels", "class", "object", "task")
 """Names of attributes, and of arrays that hold one value."""
 
-_SCALARS = (*RATES, *FULL_SCALES, *UNITS, *CLASSES)
+_SCALARS = (*RATES, *FULL_SCALES, *UNITS, *LABELS)
 
 
 class Array(Protocol):

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from adaptfault.data.recordings.errors import InputError
 from adaptfault.data.recordings.facts.labels import natural_key
+from adaptfault.data.recordings.facts.roles import readings
 from adaptfault.data.recordings.recording import Shape
 
 _TOUCH = re.compile(r"tactile|taxel|pressure|touch|skin|fsr", re.IGNORECASE)
@@ -72,7 +73,7 @@ def choose(path: Path, features: Mapping[str, Sizes], key: str | None = None) ->
         return list(arrays)
     cells = [name for name in features if not _NO_TOUCH.search(name)]
     if cells and not arrays:  # each is a cell
-        return cells
+        return [cells[i] for i in readings(cells)]
     what = "no feature has touch, tactile, taxel, pressure, skin or fsr in its name"
     raise InputError.at(path, f"{what}; {_held(features)}; name one with --key")
 

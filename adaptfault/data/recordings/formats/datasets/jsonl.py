@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from adaptfault.data.recordings.errors import InputError, Problem, located
-from adaptfault.data.recordings.formats.datasets.features import Pads, Sizes, choose
-from adaptfault.data.recordings.formats.datasets.table import (
+from adaptfault.data.recordings.errors import NO_FRAMES, InputError, Problem, located
+from adaptfault.data.recordings.facts.episodes import Division, Episode, divide, numbered
+from adaptfault.data.recordings.facts.roles import (
     EPISODES,
     LABELS,
     clock_of,
@@ -22,6 +22,7 @@ from adaptfault.data.recordings.formats.datasets.table import (
     named,
     unit_of,
 )
+from adaptfault.data.recordings.formats.datasets.features import Pads, Sizes, choose
 from adaptfault.data.recordings.recording import BLOCK, Block, Facts, Recording, Shape
 
 SUFFIXES = (".jsonl", ".ndjson")
@@ -55,12 +56,12 @@ def open(
         InputError: the file holds no frame, a line is no JSON, or the fields are not clear.
     """
     problems: list[Problem] = []
-    parts, first = _parts(path, problems, label_column)
-    clock, tick = clock_of(list(first))
+    parts, first, division = _parts(path, problems, label_column)
     own_clock = named(path, "time-column", time_column, list(first))
-    if own_clock is not None:
-        clock = own_clock
-        tick = unit_of(own_clock)
+    clock = own_clock or clock_of(list(first))
+    tick = None if clock is None else unit_of(clock)
+    if division.lost:
+        problems.append(Problem("warning", located(path, division.lost)))
     fields = {name: _sizes(value) for name, value in first.items()}
     numbers = {name: sizes for name, sizes in fields.items() if sizes is not None}
     if own_clock is not None:
@@ -68,7 +69,13 @@ def open(
     names = choose(path, numbers, key)
     sizes = [numbers[name] for name in names]
     pads = Pads.of(sizes, shape)
-    facts = Facts(path, shape=pads.shape, present=pads.present, problems=tuple(problems))
+    facts = Facts(
+        path,
+        shape=pads.shape,
+        present=pads.present,
+        inferred=tuple(filter(None, [division.inferred])),
+        problems=tuple(problems),
+    )
 
     def blocks(part: _Part) -> Callable[[], Iterator[Block]]:
         return lambda: _blocks(path, names, sizes, pads, part, clock, tick)
@@ -97,29 +104,33 @@ class _Part:
 
 def _parts(
     path: Path, problems: list[Problem], label_column: str | None
-) -> tuple[list[_Part], dict[str, Any]]:
-    """Return the recordings of a file, and its first line.
+) -> tuple[list[_Part], dict[str, Any], Division]:
+    """Return the recordings of a file, its first line, and how it is divided.
 
     Raises:
         InputError: it holds no frame, a line is no JSON, or the field of the class is not there.
     """
-    begins: list[tuple[Any, str | None, _Place]] = []
+    places: list[_Place] = []
+    numbers: list[Any] = []
+    classes: list[Any] = []
     first: dict[str, Any] = {}
     for place, line in _lines(path, _Place(), problems):
         first = first or line
-        number = line.get(first_of(EPISODES, list(line)) or "")
-        if not begins or number != begins[-1][0]:
-            stated = named(path, "label-column", label_column, list(line))
-            label = line.get(stated or first_of(LABELS, list(line)) or "")
-            begins.append((number, None if label is None else str(label), place))
-    if not begins:
-        raise InputError.at(path, "holds no frames; record it again or remove it")
-    ends = [*(place for _, _, place in begins[1:]), None]
-    parts = [
-        _Part(None if number is None else f"{path.name}, episode {number}", label, place, end)
-        for (number, label, place), end in zip(begins, ends, strict=True)
-    ]
-    return parts, first
+        places.append(place)
+        numbers.append(line.get(first_of(EPISODES, list(line)) or ""))
+        stated = named(path, "label-column", label_column, list(line))
+        classes.append(line.get(stated or first_of(LABELS, list(line)) or ""))
+    if not places:
+        raise InputError.at(path, NO_FRAMES)
+    has_numbers = any(number is not None for number in numbers)
+    episodes = numbered(numbers) if has_numbers else [Episode(0, len(places))]
+    division = divide(episodes, classes)
+    parts = []
+    for episode in division.episodes:
+        name = None if episode.name is None else f"{path.name}, {episode.name}"
+        end = places[episode.last] if episode.last < len(places) else None
+        parts.append(_Part(name, episode.label, places[episode.first], end))
+    return parts, first, division
 
 
 def _sizes(value: Any) -> Sizes | None:

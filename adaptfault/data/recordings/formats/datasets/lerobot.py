@@ -13,11 +13,11 @@ from typing import Any
 
 from adaptfault.data.recordings.errors import NO_FRAMES, InputError, Problem, located
 from adaptfault.data.recordings.facts.labels import natural_key
+from adaptfault.data.recordings.facts.roles import named
 from adaptfault.data.recordings.formats.datasets import parquet
 from adaptfault.data.recordings.formats.datasets.chooser import Stated, recordings_of
 from adaptfault.data.recordings.formats.datasets.extra import imported
 from adaptfault.data.recordings.formats.datasets.features import GUESSED, Pads, Sizes, choose
-from adaptfault.data.recordings.formats.datasets.table import named
 from adaptfault.data.recordings.formats.text import read_json_object
 from adaptfault.data.recordings.recording import Block, Facts, Recording, Shape
 

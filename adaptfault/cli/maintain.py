@@ -95,7 +95,6 @@ def _maintain(args: argparse.Namespace) -> int:
     from adaptfault.robot.maintenance import maintain
     from adaptfault.robot.new_recordings import load_new_recordings
     from adaptfault.robot.routine import Routine
-    from diagnostics.decision.numbering import Numbering
 
     routine = None if args.after is None else Routine.read(args.after)
     bundle = Bundle.open(args.bundle, **trust(args))
@@ -116,15 +115,20 @@ def _maintain(args: argparse.Namespace) -> int:
         what = "runs only where no key is asked for; give maintain --sign KEY, or sign the bundle"
         print(f"warning: version {report.version} is not signed and {what}", file=sys.stderr)
     code = report.exit_code
-    for write in (_write_report, _write_metrics):
+    for write in (_write_report, _write_metrics, _print):
         try:
             write(args, bundle, report)
         except Exception as error:  # the run is done, and its code says what was decided
             print(f"adaptfault maintain: error: {one_line(error)}", file=sys.stderr)
             code = max(code, 1)
+    return code
+
+
+def _print(args: argparse.Namespace, bundle: Bundle, report: MaintenanceReport) -> None:
+    from diagnostics.decision.numbering import Numbering
+
     numbering = Numbering.from_layout(bundle.layout, args.count_from)
     emit(args, report.to_dict(), report.text(numbering))
-    return code
 
 
 def _write_report(args: argparse.Namespace, bundle: Bundle, report: MaintenanceReport) -> None:

@@ -9,7 +9,9 @@ from __future__ import annotations
 import argparse
 import os
 import re
-from collections.abc import Iterator, Sequence
+import stat
+from collections.abc import Callable, Iterator, Sequence
+from functools import cache
 from pathlib import Path
 
 Identity = tuple[int, int]  # device and inode: the same for each spelling and each link
@@ -23,6 +25,7 @@ _RESULT = re.compile(
 # of a folder that a command writes into
 _ABOUT = ("manifest.json", "report.html", "ledger.jsonl", "result.json")
 _CHECKPOINT = "training.safetensors"
+LAYOUTS = ("layout.json", "layout.toml")  # that are read beside recordings, without an option
 _BEGIN = 4096  # bytes of a document that say what it is
 
 
@@ -84,16 +87,26 @@ def refuse_overwriting(args: argparse.Namespace, inputs: Sequence[str]) -> None:
         if place in named:
             raise ValueError(f"{option} {path}: {named[place]} names it, too; choose another name")
         named[place] = option
-    there = [path for path in inputs if os.path.exists(path)]
+    there = [path for path in (*inputs, *_layouts(inputs)) if os.path.exists(path)]
+    held = cache(_held)
     for option, path in outputs:
         for given in there:
-            conflict = _conflict(path, given)
+            conflict = _conflict(path, given, held)
             if conflict is not None:
                 raise ValueError(f"{option} {path}: {conflict}; choose another name")
 
 
-def _conflict(output: str, given: str) -> str | None:
-    """Return why an output must not be written while ``given`` is read; None where it may."""
+def _layouts(inputs: Sequence[str]) -> list[str]:
+    """Return the layouts that are read beside files."""
+    folders = {os.path.dirname(path) for path in inputs if os.path.isfile(path)}
+    return [os.path.join(folder, name) for folder in folders for name in LAYOUTS]
+
+
+def _conflict(output: str, given: str, held: Callable[[str], set[Identity]]) -> str | None:
+    """Return why an output must not be written while ``given`` is read; None where it may.
+
+    ``held`` returns what a folder holds.
+    """
     place = _identity(output)
     if place is not None and place == _identity(given):
         return "is read by this command"
@@ -106,7 +119,7 @@ def _conflict(output: str, given: str) -> str | None:
         return f"lies in {given}, and would be read as a recording of it"
     if place is None or _written_before(Path(output)):
         return None
-    if within or place in _held(given):
+    if within or place in held(given):
         return f"is there, in {given}, which is read"
     return None
 
@@ -171,8 +184,9 @@ def _identity(path: str | os.PathLike[str]) -> Identity | None:
         about = os.stat(Path(path))  # as it is written: a Path has no slash at the end
     except (OSError, ValueError):
         return None
-    kept = os.path.isfile(path) or os.path.isdir(path) or str(path).endswith(os.sep)
-    return (about.st_dev, about.st_ino) if kept else None
+    if not (stat.S_ISREG(about.st_mode) or stat.S_ISDIR(about.st_mode)):
+        return None
+    return about.st_dev, about.st_ino
 
 
 def _above(path: str) -> set[Identity]:

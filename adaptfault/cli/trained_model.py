@@ -11,15 +11,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptfault.adaptation.fault_free import Network
-from adaptfault.adaptation.result import Adaptation, load_healthy
 from adaptfault.cli.options import load_recordings, say, trust
 from adaptfault.cli.paths import is_bundle
 from adaptfault.data.recordings import Recordings
 from adaptfault.data.windows import Windows, make_windows, split
 from adaptfault.models.store import SCHEMA, read_manifest
 
-if TYPE_CHECKING:
+if TYPE_CHECKING:  # a command that opens a bundle alone needs no torch
+    from adaptfault.adaptation.fault_free import Network
+    from adaptfault.adaptation.result import Adaptation
     from adaptfault.bundle.bundle import Bundle
     from adaptfault.bundle.versions import Version
     from adaptfault.data.calibration import Calibration
@@ -58,6 +58,8 @@ class TrainedModel:
         Raises:
             FileNotFoundError, ValueError: neither, damaged, or not signed by a trusted key.
         """
+        from adaptfault.adaptation.result import Adaptation, load_healthy
+
         bundle = open_bundle(args, folder)
         if bundle is None:
             manifest = read_manifest(folder, SCHEMA)

@@ -205,6 +205,23 @@ def test_a_new_name_beside_the_recordings_and_a_result_of_an_earlier_run_are_wri
     assert "would be read as a recording" in err
 
 
+def test_the_layout_beside_a_file_that_is_read_is_kept(tmp_path, capsys):
+    np.save(tmp_path / "a.npy", np.zeros((1, 60, 1, 3, 4)))
+    layout = tmp_path / "layout.json"
+    layout.write_text(json.dumps(LAYOUT.to_dict()))
+    for output in (layout, tmp_path / "." / "layout.json"):
+        assert main(["info", str(tmp_path / "a.npy"), "--write-layout", str(output)]) == 3
+    assert json.loads(layout.read_text()) == LAYOUT.to_dict()
+    assert "is read by this command" in capsys.readouterr().err
+
+
+def test_two_outputs_of_one_name_are_refused(tmp_path, capsys):
+    np.save(tmp_path / "a.npy", np.zeros((1, 60, 1, 3, 4)))
+    twice = ["--out", str(tmp_path / "b"), "--html", str(tmp_path / "." / "b")]
+    assert main(["diagnose", str(tmp_path / "a.npy"), *twice]) == 3
+    assert "--out names it, too" in capsys.readouterr().err
+
+
 def masks():
     return iter([np.ones((3, 4), bool), np.zeros((2, 4), bool)])
 

@@ -87,7 +87,15 @@ def test_a_pipe_that_nobody_reads_any_more_is_quiet(robot):
     assert (done.returncode, done.stderr) == (0, "")
 
 
-def test_a_report_that_cannot_be_written_leaves_the_run_done_and_is_one_line(robot, capsys):
+@pytest.mark.parametrize(
+    ("what", "error", "told"),
+    [
+        ("write_report", OSError(28, os.strerror(28)), "[Errno 28] No space left on device"),
+        ("write_report", MemoryError(), "not enough memory"),
+        ("text", MemoryError(), "not enough memory"),
+    ],
+)
+def test_what_fails_after_a_run_leaves_it_done_and_is_one_line(robot, capsys, what, error, told):
     import power_cut
 
     log = str(next(robot.glob("*.npy")))
@@ -95,15 +103,19 @@ def test_a_report_that_cannot_be_written_leaves_the_run_done_and_is_one_line(rob
     with power_cut.small_versions(), pytest.MonkeyPatch.context() as patch:
 
         def full(*_, **__):
-            raise OSError(28, os.strerror(28))
+            raise error
 
-        patch.setattr("adaptfault.robot.technician_report.write_report", full)
+        places = {
+            "write_report": "adaptfault.robot.technician_report.write_report",
+            "text": "adaptfault.robot.maintenance_report.MaintenanceReport.text",
+        }
+        patch.setattr(places[what], full)
         code = main([*words, "--report", str(robot / "report.html")])
     assert code in (1, 2)
     assert Pointer.read(robot / "robot.bundle").active == 2
     out, err = capsys.readouterr()
-    assert lines(err) == ["adaptfault maintain: error: [Errno 28] No space left on device"]
-    assert "version 2" in out
+    assert lines(err) == [f"adaptfault maintain: error: {told}"]
+    assert ("version 2" in out) == (what != "text")
 
 
 @pytest.mark.parametrize(
@@ -170,6 +182,11 @@ def test_a_bundle_whose_journal_has_an_unreadable_checksum_is_maintained(robot, 
     (path / "journal.sha256").write_bytes(b"\xff\xfe")
     assert "it is readable" in Bundle.open(path).problems()[0]
     assert Bundle.open(path).problems() == []
+
+
+def test_a_command_that_opens_a_bundle_as_reference_needs_no_torch():
+    code = "import sys, adaptfault.cli.trained_model; sys.exit('torch' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=False).returncode == 0
 
 
 def test_streams_that_were_replaced_stay_as_they_are(monkeypatch):

@@ -680,6 +680,11 @@ class SelfDiagnosis:
             & spatial.drifting
             & ~(life.floats & np.isfinite(spatial.factor))
         )
+        # a group that fails as a whole explains what its cells do
+        as_one = delivers & life.as_one
+        intermittent &= ~as_one
+        noisy &= ~as_one
+        drifting &= ~as_one
         certain = silent | intermittent | noisy | drifting
         # Side by side, cells that never return to their baseline carry something that lies still.
         never_unloaded = stream.lowest > stream.scale.baseline + stream.scale.near
@@ -760,6 +765,7 @@ class SelfDiagnosis:
             wire=np.where(on_wire, life.wire, -1),
             of_wire=life.of_wire,
             share=life.share,
+            as_one=life.as_one,
             typical=self._typical(stream),
         )
 

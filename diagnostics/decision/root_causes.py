@@ -65,6 +65,7 @@ class CellFindings:
         wire: int, number of the proven wire of such a cell, from 0; -1: others.
         of_wire: float, P(this wire fails).
         share: float, of the contacts in which such a cell was dead.
+        as_one: bool, cells that read as one with those of their wire, while it fails.
     """
 
     faulty: Mask
@@ -87,6 +88,7 @@ class CellFindings:
     wire: NDArray[np.intp]
     of_wire: Floats
     share: Floats
+    as_one: Mask
     zero: Mask | None = None
     typical: Floats | None = None
 
@@ -415,6 +417,8 @@ def _does(fault: Fault, found: CellFindings, layout: SensorLayout) -> str:
     comes_and_goes = np.max([found.refuted, found.unsure, found.wire], axis=0) >= 0
     if fault.kind is FaultKind.INTERMITTENT and comes_and_goes[list(fault.cells)].any():
         share = float(np.median(found.share[list(fault.cells)]))
+        if found.as_one[list(fault.cells)].any():
+            return f"reads what all others on it read, or does not change, {share:.0%} of the time"
         return (
             f"reads nothing in {share:.0%} of the contacts that load the cells around it, and its"
             " load in the others"

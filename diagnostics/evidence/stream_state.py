@@ -556,7 +556,8 @@ class StreamState:
             touched &= moved | (rise > max(scale.near, self._noise.range))
         self.touched = self.touched | touched
         if self.reference.life is not None:
-            self.life = self.life.extend(root, known, int(numbers[0]) // SEGMENT)
+            number = int(numbers[0]) // SEGMENT
+            self.life = self.life.extend(root, known, number, self.reference.life.groups)
         jump = self.reference.jumps_seen.size(runs, self.reference.scale.full_scale)
         jumped = (jump >= SUDDEN_JUMP) & (runs.alone | still)
         self.local = self.local.extend(root, numbers, scale.root_near, runs.start, jumped)

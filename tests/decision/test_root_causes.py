@@ -32,6 +32,7 @@ HEALTHY = CellFindings(
     wire=np.full(CELLS, -1),
     of_wire=np.zeros(CELLS),
     share=ZERO,
+    as_one=NONE,
 )
 
 

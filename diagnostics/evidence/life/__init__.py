@@ -38,8 +38,9 @@ reference or the log has no contact.
 from __future__ import annotations
 
 from diagnostics.evidence.life.fitting import fit_life
-from diagnostics.evidence.life.healthy_table import FAULTS, LifeModel
+from diagnostics.evidence.life.healthy_table import FAULTS
 from diagnostics.evidence.life.levels_in_log import LifeLog
+from diagnostics.evidence.life.life_model import LifeModel
 from diagnostics.evidence.life.proof import Life, LifeTest
 from diagnostics.evidence.life.record import PIECE, LifeRecord
 from diagnostics.evidence.life.ways_to_fail import EvidenceOfLog

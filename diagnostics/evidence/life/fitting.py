@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from diagnostics.events.tiles import MOST_CELLS, tiles
 from diagnostics.evidence.life.fitting_wires import fit_wires, unknown_parts
 from diagnostics.evidence.life.folds import Fold, folds_of, joined, logs_of
+from diagnostics.evidence.life.groups import fit_groups, tested_groups
 from diagnostics.evidence.life.healthy_table import (
     AMID,
     BESIDE,
@@ -20,11 +21,11 @@ from diagnostics.evidence.life.healthy_table import (
     UNLOADED,
     ConditionalMean,
     Floats,
-    LifeModel,
     levels_of,
     loaded_beside,
 )
 from diagnostics.evidence.life.levels_in_log import LifeLog
+from diagnostics.evidence.life.life_model import LifeModel
 from diagnostics.evidence.life.proof import LifeTest
 from diagnostics.evidence.life.tables import (
     LEVELS,
@@ -115,6 +116,7 @@ class _Fit:
             units=1,
             counts=1.0,
             wires=None,
+            groups=None,
         )
         seen = [self._expected(replace(blank, means=means), fold) for means, fold in self._cross()]
         predicted = predicted_edges(
@@ -144,6 +146,10 @@ class _Fit:
         ]
         wires, of_folds = fit_wires(held_out, self._folds, self._layout)
         held_out = [replace(of, wires=own) for of, own in zip(held_out, of_folds, strict=True)]
+        groups, groups_of_folds = fit_groups(held_out, self._folds, self._layout)
+        held_out = [
+            replace(of, groups=own) for of, own in zip(held_out, groups_of_folds, strict=True)
+        ]
         # First with the dead cells known: else healthy cells would be taken for dead ones, and
         # mislead the others.
         informed = self._reached(held_out, informed=True)
@@ -152,7 +158,7 @@ class _Fit:
         of_all = independent * sum(map(len, by_unit))
         # Few units contain few unusual contacts.
         factor = 1 - _MOST_DISCOUNT / (1 + of_all / _HALF_DISCOUNT)
-        return reached.on(replace(fitted, wires=wires), factor)
+        return reached.on(replace(fitted, wires=wires, groups=groups), factor)
 
     def _cross(self) -> list[tuple[tuple[ConditionalMean, ...], Fold]]:
         return list(zip(self._held_out, self._folds, strict=True))
@@ -165,7 +171,9 @@ class _Fit:
         loaded = np.zeros(model.equal.shape)
         amid = np.zeros((d, len(AMID) + 1))
         for fold in self._folds:
-            log = LifeLog(fold.loads, fold.readings, fold.piece, model, self._layout.beside)
+            log = LifeLog(
+                fold.loads, fold.readings, fold.constant, fold.piece, model, self._layout.beside
+            )
             for k in range(self._layout.beside.shape[1]):
                 some, equal = log.same(k)
                 loaded[:, k] += some.sum(axis=0)
@@ -210,7 +218,9 @@ class _Fit:
     def _independent(self, model: LifeModel, fold: Fold) -> Floats:
         """Return the log ratio independent of the others : healthy of each unit of a fold,
         ``[units, D]``."""
-        log = LifeLog(fold.loads, fold.readings, fold.piece, model, self._layout.beside)
+        log = LifeLog(
+            fold.loads, fold.readings, fold.constant, fold.piece, model, self._layout.beside
+        )
         healthy, _ = finished(log.healthy(self._present))
         return log.by_unit(log.own - healthy)
 
@@ -227,7 +237,14 @@ class _Fit:
         each = []
         for model, fold in zip(held_out, self._folds, strict=True):
             for record in logs_of(fold):
-                log = LifeLog(record.loads, record.means, record.piece, model, self._layout.beside)
+                log = LifeLog(
+                    record.loads,
+                    record.means,
+                    record.constant,
+                    record.piece,
+                    model,
+                    self._layout.beside,
+                )
                 healthy, _ = finished(log.healthy(self._present))
                 counted = log.counted(log.own - healthy)
                 each.append(counted - counted.mean(axis=0))
@@ -255,6 +272,7 @@ class _Fit:
         reached = np.full((len(FAULTS), len(self._present)), -np.inf)
         usual = []
         of_wires: list[Floats] = []
+        of_groups: list[Floats] = []
         of_wire = np.random.default_rng(0)
         units = []
         for model, fold in zip(held_out, self._folds, strict=True):
@@ -277,6 +295,8 @@ class _Fit:
                     reached[:, healthy] = np.maximum(reached[:, healthy], found)
                     usual.append(found)
                     units.append(evidence.log.units)
+                    if model.groups is not None:
+                        of_groups.append(tested_groups(evidence.log, model.groups, known).evidence)
                     if model.wires is not None:
                         out = model.wires.on[of_wire.integers(len(model.wires.on))]
                         for without in (np.zeros_like(out), out):
@@ -289,19 +309,19 @@ class _Fit:
                             of_wires.append(finished(steps).evidence)
         most = np.quantile(np.concatenate(usual, axis=1), _HEALTHY, axis=1)
         reached = np.maximum(reached, most[:, None])
-        wires = np.zeros((1, 0))
-        if of_wires:
-            wires = np.max(of_wires, axis=0)[None]
-        return _Reached(reached, wires, int(np.median(units)))
+        wires = np.max(of_wires, axis=0, initial=0.0)[None] if of_wires else np.zeros((1, 0))
+        groups = np.max(of_groups, axis=0, initial=0.0)[None] if of_groups else np.zeros((1, 0))
+        return _Reached(reached, wires, groups, int(np.median(units)))
 
 
 @dataclass(frozen=True)
 class _Reached:
-    """Evidence that healthy cells ``[5, D]`` and wires ``[1, W]`` reach in logs of so many
-    units."""
+    """Evidence that healthy cells ``[5, D]``, wires ``[1, W]`` and groups ``[1, G]`` reach in logs
+    of so many units."""
 
     cells: Floats
     wires: Floats
+    groups: Floats
     units: int
 
     def and_of(self, other: _Reached) -> _Reached:
@@ -310,6 +330,7 @@ class _Reached:
             self,
             cells=np.maximum(self.cells, other.cells),
             wires=np.maximum(self.wires, other.wires),
+            groups=np.maximum(self.groups, other.groups),
         )
 
     def on(self, model: LifeModel, counts: float) -> LifeModel:
@@ -317,4 +338,14 @@ class _Reached:
         wires = model.wires
         if wires is not None:
             wires = replace(wires, reached=self.wires, units=self.units, counts=counts)
-        return replace(model, reached=self.cells, units=self.units, counts=counts, wires=wires)
+        groups = model.groups
+        if groups is not None:
+            groups = replace(groups, reached=self.groups, units=self.units, counts=counts)
+        return replace(
+            model,
+            reached=self.cells,
+            units=self.units,
+            counts=counts,
+            wires=wires,
+            groups=groups,
+        )

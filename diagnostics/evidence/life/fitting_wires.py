@@ -9,16 +9,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from diagnostics.evidence.life.folds import Fold
-from diagnostics.evidence.life.healthy_table import (
-    BESIDE,
-    UNLOADED,
-    Floats,
-    LifeModel,
-    Mask,
-    WireModel,
-    levels_of,
-)
+from diagnostics.evidence.life.healthy_table import FEWEST_CELLS, UNLOADED, Floats, Mask, levels_of
 from diagnostics.evidence.life.levels_in_log import LifeLog
+from diagnostics.evidence.life.life_model import LifeModel, WireModel
 from diagnostics.evidence.life.tables import (
     LEVELS,
     counts_of,
@@ -28,7 +21,7 @@ from diagnostics.evidence.life.tables import (
     shares_of_errors,
     shrinkage_of,
 )
-from diagnostics.evidence.life.wires import FEWEST_CELLS, wire_log
+from diagnostics.evidence.life.wires import wire_log
 from diagnostics.evidence.stepping import finished
 from diagnostics.healthy.cross_fitting import FOLDS
 from diagnostics.preprocessing.levels import FEWEST
@@ -90,12 +83,12 @@ def fit_wires(
     ]
     levels = edges_of(np.concatenate(loads), LEVELS)
     predicted = predicted_edges(np.concatenate(expected).ravel(), np.concatenate(loads).ravel())
-    shape = (len(on), (len(predicted) + 1) * (len(BESIDE) + 1), len(levels) + 1)
+    shape = (len(on), (len(predicted) + 1) * blank.per_level, len(levels) + 1)
     blank = replace(blank, levels=levels, predicted=predicted)
     counts = np.stack(
         [
             counts_of(
-                blank.contexts(of, fold.loads, present),
+                blank.contexts(of, own, fold.loads, fold.piece, present),
                 levels_of(own, levels),
                 shape,
                 blank.told(fold.loads, present),
@@ -109,7 +102,7 @@ def fit_wires(
     models = [replace(fitted, table=log_table(total - of, shrinkage)) for of in counts]
     ratios = []
     for model, fold, wires in zip(held_out, folds, models, strict=True):
-        log = LifeLog(fold.loads, fold.readings, fold.piece, model, layout.beside)
+        log = LifeLog(fold.loads, fold.readings, fold.constant, fold.piece, model, layout.beside)
         own, _, healthy = finished(wire_log(log, wires, present, present))
         ratios.append(own.by_unit(own.own - healthy))
     used = np.sum([(own > UNLOADED).sum(axis=0) for own in loads], axis=0) >= FEWEST

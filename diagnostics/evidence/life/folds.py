@@ -27,16 +27,17 @@ _MOST_PIECES = 6000  # of the reference: a size
 
 @dataclass(frozen=True)
 class Fold:
-    """Pieces of some reference recordings: loads and readings ``[n, D]``, piece numbers int
-    ``[n]``."""
+    """Pieces of some reference recordings: loads, readings, and which of these were constant,
+    ``[n, D]``; piece numbers int ``[n]``."""
 
     loads: Array
     readings: Array
+    constant: Mask
     piece: NDArray[np.intp]
 
     def copy(self) -> Fold:
         """Return a copy whose loads and readings can be changed."""
-        return Fold(self.loads.copy(), self.readings.copy(), self.piece)
+        return Fold(self.loads.copy(), self.readings.copy(), self.constant.copy(), self.piece)
 
     def kill(self, cell: int, source: int, rng: np.random.Generator) -> None:
         """Let a cell read, equally often, what another one (``source``) read at other times, or
@@ -45,10 +46,12 @@ class Fold:
             self.loads[:, cell] = 0.0
             # NaN without any reading
             self.readings[:, cell] = np.fmin.reduce(self.readings[:, cell])
+            self.constant[:, cell] = True
             return
         order = rng.permutation(len(self.loads))
         self.loads[:, cell] = self.loads[order, source]
         self.readings[:, cell] = self.readings[order, source]
+        self.constant[:, cell] = self.constant[order, source]
 
 
 def folds_of(
@@ -72,7 +75,7 @@ def folds_of(
             log = np.concatenate([blocks[i] for i in some])
             record, begin = _recorded(log, begin, present, scale, offset)
             if record.number:
-                parts.append(Fold(record.loads, record.means, record.piece))
+                parts.append(Fold(record.loads, record.means, record.constant, record.piece))
         if not parts:
             return None
         folds.append(joined(parts))
@@ -84,6 +87,7 @@ def joined(parts: Sequence[Fold]) -> Fold:
     return Fold(
         np.concatenate([part.loads for part in parts]),
         np.concatenate([part.readings for part in parts]),
+        np.concatenate([part.constant for part in parts]),
         np.concatenate([part.piece for part in parts]),
     )
 
@@ -95,6 +99,7 @@ def _recorded(
     tracked = OffsetTracker.begin(log.shape[1])
     root: list[Array] = []
     readings: list[Array] = []
+    flat: list[Mask] = []
     number: list[int] = []
     for first in range(0, len(log), SEGMENT):
         frames = log[first : first + SEGMENT]
@@ -105,8 +110,10 @@ def _recorded(
         )
         root += one.root
         readings += one.readings
+        flat += one.flat
         number += one.number
-    return LifeRecord(tuple(root), tuple(readings), tuple(number)), begin + len(log) // SEGMENT + 1
+    record = LifeRecord(tuple(root), tuple(readings), tuple(flat), (), tuple(number))
+    return record, begin + len(log) // SEGMENT + 1
 
 
 def logs_of(fold: Fold) -> list[LifeRecord]:
@@ -114,10 +121,13 @@ def logs_of(fold: Fold) -> list[LifeRecord]:
     numbers, begins = np.unique(fold.piece // (SEGMENT // PIECE), return_index=True)
     loads = np.split(fold.loads, begins[1:])
     readings = np.split(fold.readings, begins[1:])
+    flat = np.split(fold.constant, begins[1:])
     return [
         LifeRecord(
             tuple(loads[first : first + KEPT]),
             tuple(readings[first : first + KEPT]),
+            tuple(flat[first : first + KEPT]),
+            (),
             tuple(numbers[first : first + KEPT].tolist()),
         )
         for first in range(0, len(numbers), KEPT)

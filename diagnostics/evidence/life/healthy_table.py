@@ -3,10 +3,8 @@ predicted level)."""
 
 from __future__ import annotations
 
-from collections.abc import Generator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,9 +12,6 @@ from numpy.typing import NDArray
 from diagnostics.healthy.dual_ridge import covariance_and_precision, regression_on_known
 from diagnostics.preprocessing.levels import MARGIN
 from diagnostics.preprocessing.scale import Array
-
-if TYPE_CHECKING:
-    from diagnostics.layout import SensorLayout
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -41,8 +36,11 @@ AMID = (
     0.25,
     0.6,
 )
-_STEPS = 4  # of a prediction: a size
 BESIDE = (0.01, 0.34, 0.67, 0.99)  # shares of the cells beside one that are loaded, between levels
+FEWEST_CELLS = 3  # of a wire or a group, from which on they tell of it
+STATES = 10  # of a group, see groups
+FULL = 0.995  # root load of a cell at full scale
+BEFORE = 3  # what a wire was a piece ago: unknown, at rest, loaded
 
 
 @dataclass(frozen=True)
@@ -199,6 +197,11 @@ class HealthyTable:
         factors: Floats = self.counts * THRESHOLD / np.maximum(THRESHOLD, MARGIN * reached)
         return factors
 
+    @property
+    def n_levels(self) -> int:
+        """Number K of levels that are observed."""
+        return len(self.levels) + 1
+
     @cached_property
     def probabilities(self) -> Floats:
         """P(observed level | context), shape of ``table``."""
@@ -207,156 +210,3 @@ class HealthyTable:
     def of_cell(self, cells: Cells) -> Cells:
         """Return where the table of each is."""
         return cells % len(self.table)
-
-
-@dataclass(frozen=True)
-class WireModel(HealthyTable):
-    """Mean loads of healthy wires, given the cells that are not on them.
-
-    Attributes:
-        on: bool ``[W, D]``, cells on each wire.
-        beside: bool ``[W, D]``, cells beside these that are not.
-    """
-
-    on: Mask
-    beside: Mask
-
-    def told(self, loads: Array, known: Mask) -> Mask:
-        """Return in which pieces some known cell off each wire is loaded, bool ``[n, W]``.
-
-        The others tell nothing of a wire where none of them is loaded: the pieces that are kept of
-        a log hold some load, which is then its own, or that of a faulty cell.
-        """
-        others = (~self.on & known).astype(np.float32)
-        found: Mask = (loads > UNLOADED).astype(np.float32) @ others.T > 0
-        return found
-
-    def contexts(self, expected: Floats, loads: Array, known: Mask) -> NDArray[np.intp]:
-        """Return what the others say of each wire, 0 to M - 1, int ``[n, W]``.
-
-        Args:
-            expected: mean loads that they predict, ``[n, W]``.
-            loads: root loads ``[n, D]``.
-            known: bool ``[D]``, cells that predict others.
-        """
-        near = (self.beside & known).astype(np.float32)
-        loaded = (loads > UNLOADED).astype(np.float32) @ near.T
-        share = loaded / np.maximum(near.sum(axis=1), 1)
-        level = levels_of(expected, self.predicted).astype(np.intp)
-        return level * (len(BESIDE) + 1) + levels_of(share, np.asarray(BESIDE))
-
-    def means(self, values: Array, eligible: Mask) -> Floats:
-        """Return the means ``[n, W]`` over the eligible cells (bool ``[D]``) of each wire, of
-        values ``[n, D]``."""
-        of = (self.on & eligible).astype(np.float64)
-        found: Floats = values @ (of / np.maximum(of.sum(axis=1, keepdims=True), 1)).T
-        return found
-
-    def expected(
-        self, means: Sequence[ConditionalMean], loads: Array, known: Mask, eligible: Mask
-    ) -> Generator[None, None, Floats]:
-        """Yield between steps; return the mean load that the known cells off each wire predict,
-        ``[n, W]``.
-
-        Args:
-            means: predictions of the cells.
-            loads: root loads ``[n, D]``.
-            known: bool ``[D]``, cells that predict others.
-            eligible: bool ``[D]``, cells over which the mean is taken.
-        """
-        found = np.zeros((len(loads), len(self.on)))
-        for w, on in enumerate(self.on):
-            of = on & eligible
-            for mean in means:
-                if of[mean.outputs].any():
-                    found[:, w] += mean.expected_sum(loads, known, on, of)
-            found[:, w] /= max(1, of.sum())
-            yield
-        return found
-
-
-@dataclass(frozen=True)
-class LifeModel(HealthyTable):
-    """What healthy cells do, given the others: ``reached`` is of the ``FAULTS``.
-
-    Attributes:
-        means: predictions, for each tile; each cell is an output of one.
-        equal: float ``[D, 8]``, probability that a healthy cell reads the same as one beside it
-            throughout a unit.
-        amid: float ``[D, 5]``, probability of each level of how far a healthy cell reads from the
-            mean beside it.
-        tolerance: a cell whose readings lie within this of its highest one reads it, in the
-            layout's unit.
-        wires: of the cells' wires; None: there are none with enough cells.
-    """
-
-    means: tuple[ConditionalMean, ...]
-    equal: Floats
-    amid: Floats
-    tolerance: float
-    wires: WireModel | None
-
-    def check(self, layout: SensorLayout) -> None:
-        """Raise ValueError unless this is a model of ``layout``."""
-        outputs = np.concatenate([mean.outputs for mean in self.means])
-        if not np.array_equal(np.sort(outputs), np.flatnonzero(layout.present)):
-            raise ValueError(f"the proof of life does not cover each cell of {layout} exactly once")
-        shape = (self.n_contexts, len(self.levels) + 1)
-        if self.table.shape not in ((1, *shape), (layout.n_cells, *shape)):
-            raise ValueError(f"expected a table [1 or {layout.n_cells}, {shape[0]}, {shape[1]}]")
-        if self.reached.shape != (len(FAULTS), layout.n_cells):
-            raise ValueError(f"expected reached [{len(FAULTS)}, {layout.n_cells}]")
-        if self.errs.shape != (layout.n_cells,):
-            raise ValueError(f"expected errs [{layout.n_cells}]")
-        if self.equal.shape != layout.beside.shape or self.amid.shape != (
-            layout.n_cells,
-            len(AMID) + 1,
-        ):
-            raise ValueError(f"expected equal and amid of {layout}")
-        probabilities = np.concatenate(
-            [[self.independent], self.errs, self.equal.ravel(), self.amid.ravel()]
-        )
-        if not ((probabilities > 0) & (probabilities <= 1)).all():
-            raise ValueError("expected probabilities between 0 and 1")
-
-    @property
-    def n_contexts(self) -> int:
-        """Number M of contexts."""
-        return (len(self.predicted) + 1) * (len(BESIDE) + 1)
-
-    def expected(self, loads: Array, known: Mask) -> Floats:
-        """Return the expected root loads ``[n, D]``, given those of the ``known`` cells (bool
-        ``[D]``)."""
-        found = np.zeros(loads.shape)
-        for mean in self.means:
-            found[:, mean.outputs] = mean.predict(loads, known)
-        return found
-
-    def contexts(
-        self, loads: Array, known: Mask, beside: Cells
-    ) -> Generator[None, None, NDArray[np.intp]]:
-        """Yield between steps; return what the others say of each cell, 0 to M - 1, int
-        ``[n, D]``."""
-        level = np.zeros(loads.shape, np.uint8)
-        each = -(-len(self.means) // _STEPS)
-        for k, mean in enumerate(self.means):
-            level[:, mean.outputs] = levels_of(mean.predict(loads, known), self.predicted)
-            if k % each == 0:
-                yield
-        around = loaded_beside(loads, known, beside)
-        return level.astype(np.intp) * (len(BESIDE) + 1) + around
-
-    def otherwise(self, gain: float, offset: float, cells: Cells) -> Floats:
-        """Return P(observed level | context) of cells with a gain and an offset (of full scale),
-        ``[cells, M, K]``."""
-        above = np.append(self.levels, 1.0)
-        below = np.append(0.0, self.levels)
-        middle = (above + below) / 2
-        middle[0] = 0.0
-        load = np.clip(gain * middle**2 + offset, 0.0, 1.0)
-        becomes = levels_of(np.sqrt(load), self.levels)
-        table = self.probabilities[self.of_cell(cells)]
-        found = np.full(table.shape, GUESS / len(middle))
-        for before, after in enumerate(becomes.tolist()):
-            found[:, :, after] += (1 - GUESS) * table[:, :, before]
-        return found

@@ -16,11 +16,11 @@ from diagnostics.evidence.life.healthy_table import (
     Floats,
     HealthyTable,
     Levels,
-    LifeModel,
     Mask,
     levels_of,
 )
-from diagnostics.evidence.life.record import PIECE
+from diagnostics.evidence.life.life_model import LifeModel
+from diagnostics.evidence.life.record import PIECE, LifeRecord
 from diagnostics.evidence.stepping import finished
 from diagnostics.preprocessing.readings import spread
 from diagnostics.preprocessing.scale import Array
@@ -43,6 +43,8 @@ class LevelLog:
         piece: number of each, int ``[n]``, ascending.
         model: of healthy loads.
         weight: of each unit ``[units]``; None: see the property.
+        level: of each load, ``[n, D]``; None: by the limits of the model.
+        unit: pieces of a unit.
 
     Attributes:
         level: of each load, ``[n, D]``.
@@ -56,16 +58,18 @@ class LevelLog:
         piece: NDArray[np.intp],
         model: HealthyTable,
         weight: Floats | None = None,
+        level: Levels | None = None,
+        unit: int = UNIT,
     ) -> None:
         self.table = model
         self.loads = loads
         self._weight = weight
-        self.level = levels_of(loads, model.levels)
+        self.level = levels_of(loads, model.levels) if level is None else level
         self.piece = piece
         self.readings = readings
         self._read = np.isfinite(readings)
         self._all_read = bool(self._read.all())
-        self.unit_begins = np.flatnonzero(np.diff(piece // UNIT, prepend=-1))
+        self.unit_begins = np.flatnonzero(np.diff(piece // unit, prepend=-1))
         self._cell = np.arange(self.level.shape[1])
 
     @property
@@ -82,7 +86,7 @@ class LevelLog:
     @cached_property
     def own(self) -> Floats:
         """Log frequency of each level in the other pieces of the cell, ``[n, D]``."""
-        n_levels = len(self.table.levels) + 1
+        n_levels = self.table.n_levels
         others = np.maximum(_counted(self.level, n_levels) - 1, 0)
         log_frequency = np.log((others + 1 / n_levels) / len(self.level))
         found: Floats = log_frequency[self._cell, self.level]
@@ -91,7 +95,7 @@ class LevelLog:
     @cached_property
     def at_rest(self) -> Floats:
         """Log probability of each level of a cell without load, ``[n, D]``."""
-        n_levels = len(self.table.levels) + 1
+        n_levels = self.table.n_levels
         loaded = np.log((1 - _AT_REST) / (n_levels - 1))
         found = np.full(self.level.shape, loaded)
         found[self.level == 0] = np.log(_AT_REST)
@@ -183,22 +187,38 @@ class LifeLog(LevelLog):
     Args:
         loads: mean root loads of the pieces, ``[n, D]``.
         readings: their mean readings ``[n, D]``, in the layout's unit.
+        constant: bool ``[n, D]``, where the readings of the piece did not change.
         piece: number of each, int ``[n]``, ascending.
         model: of healthy cells.
         beside: int ``[D, 8]``, the cells beside each; -1: none.
+
+    Attributes:
+        ends_as_one: int ``[n, G]``, frames at the end of each piece in which a group reads as one;
+            None: unknown.
     """
+
+    ends_as_one: NDArray[np.uint8] | None = None
 
     def __init__(
         self,
         loads: Array,
         readings: Array,
+        constant: Mask,
         piece: NDArray[np.intp],
         model: LifeModel,
         beside: Cells,
     ) -> None:
         super().__init__(loads, readings, piece, model)
+        self.constant = constant
         self.model = model
         self.beside = beside
+
+    @classmethod
+    def of(cls, record: LifeRecord, model: LifeModel, beside: Cells) -> LifeLog:
+        """Return the levels in the record of a log."""
+        log = cls(record.loads, record.means, record.constant, record.piece, model, beside)
+        log.ends_as_one = record.frames_as_one if record.ends_as_one else None
+        return log
 
     def healthy(self, known: Mask) -> Generator[None, None, tuple[Floats, NDArray[np.intp]]]:
         """Yield between steps; return log P(level | healthy) and the context, ``[n, D]`` each.

@@ -35,22 +35,25 @@ def opens_under_load(
     return found
 
 
-def dies_and_recovers(dead: Floats) -> tuple[Floats, Floats]:
+def dies_and_recovers(
+    dead: Floats, fails: float = _FAILS, recovers: float = _RECOVERS
+) -> tuple[Floats, Floats]:
     """Return the log evidence ``[D]`` of a cell that dies and recovers, and P(dead) in each unit
     ``[units, D]``.
 
     Args:
         dead: float ``[units, D]``, log ratio dead : healthy, bounded.
+        fails, recovers: probabilities per unit.
     """
     likelihood = np.exp(dead)
-    gone = np.full(dead.shape[1], _FAILS)
+    gone = np.full(dead.shape[1], fails)
     dying = np.empty(dead.shape)
     total = np.empty(dead.shape)
-    total_before = 1 + _FAILS
+    total_before = 1 + fails
     # The forward algorithm; the probabilities are scaled to a sum of 1 after each unit.
     gone /= total_before
     for u, ratio in enumerate(likelihood):
-        stays = (1 - _FAILS) - (1 - _FAILS - _RECOVERS) * gone
+        stays = (1 - fails) - (1 - fails - recovers) * gone
         gone = (1 - stays) * ratio
         total[u] = stays + gone
         gone /= total[u]

@@ -57,6 +57,7 @@ class Life:
         highest: float, highest reading of a piece, in the layout's unit.
         wire: int, number of the wire that fails now and then, from 0; -1: none.
         of_wire: float, P(this wire fails); 0: none.
+        as_one: bool, cells that read as one with those of their wire, while it fails.
         floats: bool, certain cells that do not follow the others at all, not with a lower gain
             either.
         contradicting: share of the tested cells that are refuted, where it is so large that all are
@@ -77,6 +78,7 @@ class Life:
     highest: Floats
     wire: NDArray[np.intp]
     of_wire: Floats
+    as_one: Mask
     floats: Mask
     contradicting: float
 
@@ -101,6 +103,7 @@ class Life:
             highest=nothing,
             wire=zero - 1,
             of_wire=nothing,
+            as_one=no,
             floats=no,
             contradicting=0.0,
         )
@@ -274,12 +277,13 @@ def _concluded(
         lag=ways.lag,
         source=ways.source,
         share=np.where(wires.refuted, wires.share, ways.share),
-        since=np.where(against[0], 0, first),
+        since=np.where(wires.as_one, wires.since, np.where(against[0], 0, first)),
         against=against,
         begins=log.begins,
         highest=ways.highest,
         wire=wires.wire,
         of_wire=wires.probability,
+        as_one=wires.as_one,
         floats=certain & (kind == 0),
         contradicting=contradicting,
     )

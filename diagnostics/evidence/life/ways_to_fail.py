@@ -21,10 +21,10 @@ from diagnostics.evidence.life.healthy_table import (
     THRESHOLD,
     Cells,
     Floats,
-    LifeModel,
     Mask,
 )
 from diagnostics.evidence.life.levels_in_log import LifeLog, bounded
+from diagnostics.evidence.life.life_model import LifeModel
 from diagnostics.evidence.life.over_time import (
     dies_and_recovers,
     from_some_unit,
@@ -134,7 +134,7 @@ class EvidenceOfLog:
         """Return the evidence of a log; None: it holds too little, and tells nothing."""
         if len(record.number) < _FEWEST_SEGMENTS:
             return None
-        return cls(LifeLog(record.loads, record.means, record.piece, model, beside))
+        return cls(LifeLog.of(record, model, beside))
 
     def suspicion(self, known: Mask) -> Generator[None, None, Suspicion]:
         """Yield between steps; return the evidence of the two faults that all others are near."""

@@ -13,21 +13,16 @@ level while it is open. A wire that breaks once and for all is found by its cons
 from __future__ import annotations
 
 from collections.abc import Generator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import expit
 
-from diagnostics.evidence.life.healthy_table import (
-    AGAINST,
-    BESIDE,
-    THRESHOLD,
-    Floats,
-    Mask,
-    WireModel,
-)
+from diagnostics.evidence.life.groups import tested_groups
+from diagnostics.evidence.life.healthy_table import AGAINST, FEWEST_CELLS, THRESHOLD, Floats, Mask
 from diagnostics.evidence.life.levels_in_log import LevelLog, LifeLog
+from diagnostics.evidence.life.life_model import WireModel
 from diagnostics.evidence.life.over_time import (
     dies_and_recovers,
     from_some_unit,
@@ -35,7 +30,6 @@ from diagnostics.evidence.life.over_time import (
 )
 from diagnostics.preprocessing.levels import CERTAIN_RATIO, EXPECTED_LATE, MAJORITY, TESTED
 
-FEWEST_CELLS = 3  # of a wire, from which on they tell of it
 # Evidence that makes up for how rare broken wires are, and for contacts unlike the reference's.
 _BROKEN = CERTAIN_RATIO / 2 - float(np.log(EXPECTED_LATE))
 _PROVEN = _BROKEN + float(np.log(9.0))  # at odds of 9
@@ -65,6 +59,8 @@ class FailingWires:
         probability: float ``[D]``, of this wire; 0: none.
         against: bool ``[units, D]``, units in which these were at rest.
         share: float ``[D]``, share of the tested units in which they were at rest.
+        as_one: bool ``[D]``, cells that read as one, instead of being at rest.
+        since: int ``[D]``, number of the first frame in which these did.
     """
 
     evidence: Floats
@@ -72,6 +68,40 @@ class FailingWires:
     probability: Floats
     against: Mask
     share: Floats
+    as_one: Mask
+    since: NDArray[np.intp]
+
+    @classmethod
+    def none(cls, units: int, n_cells: int) -> FailingWires:
+        """Return what is known before any test."""
+        zero = np.zeros(n_cells)
+        no = np.zeros(n_cells, bool)
+        against = np.zeros((units, n_cells), bool)
+        since = np.zeros(n_cells, np.intp)
+        return cls(zero, np.full(n_cells, -1), zero, against, zero, no, since)
+
+    def with_one(
+        self, on: Mask, scaled: float, dead: Floats, *, since: int | None = None
+    ) -> FailingWires:
+        """Return what is known with one more that fails.
+
+        Args:
+            on: bool ``[D]``, its cells.
+            scaled: its evidence, after the factors.
+            dead: float ``[units]``, the same of each unit.
+            since: number of the first frame in which its cells read as one; None: they are at
+                rest.
+        """
+        share = (dead > TESTED).sum() / max(1, (np.abs(dead) > TESTED).sum())
+        return FailingWires(
+            np.where(on, np.maximum(self.evidence, scaled), self.evidence),
+            np.where(on, self.wire.max() + 1, self.wire),
+            np.where(on, expit(scaled - _BROKEN), self.probability),
+            np.where(on, (dead > AGAINST)[:, None], self.against),
+            np.where(on, share, self.share),
+            self.as_one | (on & (since is not None)),
+            np.where(on, since or 0, self.since),
+        )
 
     @property
     def refuted(self) -> Mask:
@@ -94,9 +124,10 @@ def wire_log(
     """
     told = wires.told(log.loads, known)
     readings = np.where(told, wires.means(log.readings, eligible), np.nan)
-    own = LevelLog(wires.means(log.loads, eligible), readings, log.piece, wires, log.weight)
+    means = wires.means(log.loads, eligible)
+    own = LevelLog(means, readings, log.piece, wires, log.weight)
     expected = yield from wires.expected(log.model.means, log.loads, known, eligible)
-    context = wires.contexts(expected, log.loads, known)
+    context = wires.contexts(expected, means, log.loads, log.piece, known)
     healthy = own.tilted(wires.probabilities, context, own.level)
     return own, context, healthy
 
@@ -112,7 +143,7 @@ def tested_wires(
     ratio = np.where(own.level > 0, np.minimum(ratio, 0.0), ratio)
     dead = own.counted(ratio)
     intermittent, _ = dies_and_recovers(dead)
-    opens = yield from opens_under_load(own, ratio, context // (len(BESIDE) + 1))
+    opens = yield from opens_under_load(own, ratio, context // wires.per_level)
     evidence = np.maximum(intermittent, opens)
     # Its cells tell more of a wire that broke once and for all: the value that they hold, since
     # when.
@@ -132,27 +163,45 @@ def tested_wires(
 def failing_wires(log: LifeLog, known: Mask, eligible: Mask) -> Generator[None, None, FailingWires]:
     """Yield between steps; return what the wires say of each cell; arguments as in
     :func:`wire_log`."""
-    evidence = np.zeros(len(known))
-    wire = np.full(len(known), -1)
-    probability = np.zeros(len(known))
-    against = np.zeros((log.units, len(known)), bool)
-    share = np.zeros(len(known))
+    failing = _failing_groups(log, eligible)
+    yield
     wires = log.model.wires
+    found = 0
     while wires is not None:
-        found = yield from tested_wires(log, wires, known & (wire < 0), eligible & (wire < 0))
-        scaled = found.evidence * wires.factors(log.units)[0]
-        of_cell = np.where(wires.on & eligible & (wire < 0), scaled[:, None], 0.0).max(axis=0)
-        evidence = np.maximum(evidence, of_cell)
+        free = ~failing.refuted
+        test = yield from tested_wires(log, wires, known & free, eligible & free)
+        scaled = test.evidence * wires.factors(log.units)[0]
+        of_cell = np.where(wires.on & eligible & free, scaled[:, None], 0.0).max(axis=0)
+        failing = replace(failing, evidence=np.maximum(failing.evidence, of_cell))
         worst = int(np.argmax(scaled))
         if scaled[worst] <= _PROVEN:
             break
-        if wire.max() + 1 == _MOST_WIRES:
-            wire[:] = -1
-            break
-        on = wires.on[worst] & eligible & (wire < 0)
-        dead = found.dead[:, worst]
-        against[:, on] = (dead > AGAINST)[:, None]
-        share[on] = (dead > TESTED).sum() / max(1, (np.abs(dead) > TESTED).sum())
-        wire[on] = wire.max() + 1
-        probability[on] = expit(scaled[worst] - _BROKEN)
-    return FailingWires(evidence, wire, probability, against, share)
+        if found == _MOST_WIRES:
+            return replace(failing, wire=np.full(len(known), -1))
+        on = wires.on[worst] & eligible & free
+        failing = failing.with_one(on, float(scaled[worst]), test.dead[:, worst])
+        found += 1
+    return failing
+
+
+def _failing_groups(log: LifeLog, eligible: Mask) -> FailingWires:
+    """Return what the groups say of each cell: of those that fail the largest first, which explain
+    the groups in them."""
+    failing = FailingWires.none(log.units, len(eligible))
+    groups = log.model.groups
+    if groups is None:
+        return failing
+    test = tested_groups(log, groups, eligible)
+    scaled = test.evidence * groups.factors(log.units)[0]
+    of_cell = np.where(groups.on & eligible, scaled[:, None], 0.0).max(axis=0)
+    proven = scaled > _PROVEN
+    # What most of them do is the array's, or that of the recordings.
+    if proven.sum() > MAJORITY * len(proven):
+        return failing
+    failing = replace(failing, evidence=of_cell)
+    for g in np.argsort(-groups.on.sum(axis=1), kind="stable").tolist():
+        on = groups.on[g] & eligible & ~failing.refuted
+        if proven[g] and on.any():
+            since = int(test.since[g])
+            failing = failing.with_one(on, float(scaled[g]), test.dead[:, g], since=since)
+    return failing

@@ -11,7 +11,7 @@ PYTHON ?= $(shell for p in python3.11 /usr/bin/python3.11 python3.12 python3.13 
 	$$p -c 'import ensurepip, venv, sys; sys.exit(sys.version_info < (3, 10))' >/dev/null 2>&1 && echo $$p && break; done)
 BIN := .venv/bin
 
-.PHONY: demo test test-all test-cpus check quick-tests all-tests examples benchmark docs wheel-check test-pythons findings format clean
+.PHONY: demo test test-all test-cpus check quick-tests all-tests examples benchmark docs wheel-check test-pythons format clean
 
 demo: .venv/installed
 	$(BIN)/adaptfault demo
@@ -74,11 +74,6 @@ test-pythons:
 		$(MAKE) --no-print-directory BIN=.venv-$$version/bin quick-tests && \
 		touch .venv-$$version/tested || exit 1; \
 	done; rm -f .venv-*/tested
-
-# Behaviour of other libraries that surprises; each script installs what it needs in a temporary folder. No part of CI.
-findings:
-	@failed=0; for script in findings/*.sh; do test -e "$$script" || continue; echo "$$script"; \
-		PYTHON='$(PYTHON)' sh "$$script" || { echo "$$script: it behaves otherwise here"; failed=1; }; done; exit $$failed
 
 format: .venv/installed-dev
 	$(BIN)/ruff check --fix .

@@ -160,7 +160,7 @@ class Forecast:
         many = "many new recordings" if np.isinf(self.n_new) else f"{self.n_new:g} new ones"
         lines = [
             f"expected {self.measure} without {k} cells, from {self.n_recordings} recordings (95 %"
-            f" interval, {many} of the same objects):"
+            f" interval, {many}):"
         ]
         lines += [f"  {name:10s} {expected}" for name, expected in self.stages.items()]
         if self.worst_class is not None:

@@ -8,8 +8,7 @@ import logging
 import math
 import sys
 import traceback
-from collections.abc import Callable, Iterator, Sequence
-from difflib import get_close_matches
+from collections.abc import Callable, Sequence
 from typing import Any, NoReturn
 
 from adaptfault import __version__
@@ -75,48 +74,9 @@ class _Parser(argparse.ArgumentParser):
         for kind in (int, float):
             self.register("type", kind, _number(kind))
 
-    def parse_command(self, argv: Sequence[str] | None) -> argparse.Namespace:
-        """Parse the arguments of a command; an option that it does not have is an error of its
-        own, with its usage."""
-        args, unknown = self.parse_known_args(argv)
-        if unknown:
-            parser: argparse.ArgumentParser = getattr(args, "usage_of", self)
-            options = [name for action in parser._actions for name in action.option_strings]
-            near = get_close_matches(unknown[0].partition("=")[0], options, n=1)
-            meant = f"; did you mean {near[0]}?" if near else ""
-            parser.error(f"unrecognized arguments: {' '.join(unknown)}{meant}")
-        return args
-
     def error(self, message: str) -> NoReturn:
         self.print_usage(sys.stderr)
         self.exit(BAD_INPUT, f"{self.prog}: error: {message}\n")
-
-
-class _Completion(argparse.Action):
-    """Prints completions of all commands and options, and of files for all others."""
-
-    def __call__(self, parser: argparse.ArgumentParser, *given: Any) -> NoReturn:
-        """Print those of the shell that is named."""
-        try:
-            import shtab
-        except ImportError:
-            parser.error("completions need shtab: pip install 'adaptfault[completion]'")
-        for one in _leaves(parser):
-            for action in one._actions:
-                if action.choices is None and action.nargs != 0:
-                    action.complete = shtab.FILE  # type: ignore[attr-defined]
-        print(shtab.complete(parser, given[1]))
-        parser.exit()
-
-
-def _leaves(parser: argparse.ArgumentParser) -> Iterator[argparse.ArgumentParser]:
-    """Yield the parsers of all commands."""
-    inner = [a for a in parser._actions if isinstance(a, argparse._SubParsersAction)]
-    if not inner:
-        yield parser
-    for action in inner:
-        for command in action.choices.values():
-            yield from _leaves(command)
 
 
 def _parser() -> _Parser:
@@ -132,12 +92,6 @@ def _parser() -> _Parser:
         ),
     )
     parser.add_argument("--version", action="version", version=f"adaptfault {__version__}")
-    parser.add_argument(
-        "--print-completion",
-        action=_Completion,
-        choices=("bash", "zsh", "tcsh"),
-        help="print completions for a shell; they need adaptfault[completion]",
-    )
     commands = parser.add_subparsers(dest="command", metavar="COMMAND")
     for module in plugins(GROUP, BUILT_IN).values():
         module.add(commands)
@@ -162,8 +116,6 @@ def _failed(args: argparse.Namespace, error: Exception) -> int:
     """
     if is_unread(error):
         return 0
-    if getattr(args, "verbose", False):
-        traceback.print_exception(error)
     if isinstance(error, ValueError | OSError) or is_shortage(error):
         print(f"adaptfault {args.command}: error: {one_line(error)}", file=sys.stderr)
         return BAD_INPUT
@@ -171,8 +123,7 @@ def _failed(args: argparse.Namespace, error: Exception) -> int:
         what = "what it reads nests too deep; check the files that were given"
         print(f"adaptfault {args.command}: error: {what}", file=sys.stderr)
         return BAD_INPUT
-    if not getattr(args, "verbose", False):
-        traceback.print_exception(error)
+    traceback.print_exception(error)
     print(
         f"adaptfault {args.command}: internal error; please report the lines above",
         file=sys.stderr,
@@ -185,15 +136,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     unusable input."""
     prepare()
     parser = _parser()
-    args = parser.parse_command(argv)
+    args = parser.parse_args(argv)
     if args.command is None:
         parser.print_help()
         return 0
     log = logging.getLogger("adaptfault")
     handler = LogAboveBars()
     log.addHandler(handler)
-    if getattr(args, "verbose", False):
-        log.setLevel(logging.DEBUG)
     try:
         check_paths(args)
         code = int(args.run(args))
@@ -206,4 +155,3 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _failed(args, error)
     finally:
         log.removeHandler(handler)
-        log.setLevel(logging.NOTSET)

@@ -120,8 +120,6 @@ def _write(
     args: argparse.Namespace, log: Opened, checked: DataSetCheck, code: int, notes: list[str]
 ) -> None:
     from adaptfault.data.atomic import atomic_write
-    from adaptfault.data.recordings.valid import valid_masks, write_valid
-    from adaptfault.inspection.data_set import not_whole
 
     diagnosis = checked.inspection.diagnosis
     if args.out:
@@ -130,9 +128,9 @@ def _write(
         atomic_write(args.badge, checked.badge().encode())
     if args.html:
         compared = bool(args.reference or args.healthy)
-        masks = valid_masks(iter(log), diagnosis.faults, log.layout)
-        episodes = not_whole(masks, log.names, log.layout)
-        write_page(args, diagnosis, code, notes, compared=compared, episodes=episodes)
+        write_page(args, diagnosis, code, notes, compared=compared)
     if args.write_valid:
+        from adaptfault.data.recordings.valid import valid_masks, write_valid
+
         masks = valid_masks(iter(log), diagnosis.faults, log.layout)
         write_valid(args.write_valid, masks, log.names, log.layout, log.origins)

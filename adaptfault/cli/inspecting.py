@@ -23,7 +23,6 @@ if TYPE_CHECKING:
 
     from adaptfault.bundle.bundle import Bundle
     from adaptfault.data.recordings import Opened, Recordings
-    from adaptfault.inspection.data_set import Episode
     from adaptfault.inspection.inspection import Finding, Inspection
     from adaptfault.inspection.severity import Reason
     from diagnostics import Diagnosis, SelfDiagnosis
@@ -85,16 +84,9 @@ def inspect_log(
 
 
 def write_page(
-    args: argparse.Namespace,
-    diagnosis: Diagnosis,
-    code: int,
-    notes: list[str],
-    *,
-    compared: bool,
-    episodes: list[Episode] | None = None,
+    args: argparse.Namespace, diagnosis: Diagnosis, code: int, notes: list[str], *, compared: bool
 ) -> None:
-    """Write the page that ``--html`` asks for; it says what the exit code and the notes say.
-    ``episodes``: of a data set, those that are not whole."""
+    """Write the page that ``--html`` asks for; it says what the exit code and the notes say."""
     from adaptfault.evaluation.html_diagnosis import write_diagnosis
 
     name = ", ".join(args.recordings)
@@ -106,7 +98,6 @@ def write_page(
         code=code,
         notes=notes,
         count_from=args.count_from,
-        episodes=episodes,
     )
 
 

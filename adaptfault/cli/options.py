@@ -28,7 +28,7 @@ _PLACES = ("key", "topic", "field", "columns", "ignore", "time_column", "label_c
 
 
 def command(commands: Commands, name: str, summary: str, example: str) -> argparse.ArgumentParser:
-    """Add a command whose ``--help`` ends with an example, and the options of every command."""
+    """Add a command whose ``--help`` ends with an example, and the option ``--json``."""
     parser: argparse.ArgumentParser = commands.add_parser(
         name,
         help=summary,
@@ -37,11 +37,7 @@ def command(commands: Commands, name: str, summary: str, example: str) -> argpar
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--json", action="store_true", help="print the result as JSON")
-    parser.add_argument("-q", "--quiet", action="store_true", help="no progress on stderr")
-    parser.add_argument(
-        "-v", "--verbose", action="store_true", help="more on stderr: where an error comes from"
-    )
-    parser.set_defaults(usage_of=parser)
+    parser.add_argument("--quiet", action="store_true", help="no progress on stderr")
     return parser
 
 

@@ -229,12 +229,7 @@ def recordings_of(windows: Windows, layout: SensorLayout) -> list[NDArray[np.flo
 
 
 def split(
-    windows: Windows,
-    *,
-    test: float = 0.2,
-    validation: float = 0.2,
-    seed: int = 0,
-    groups: ArrayLike | None = None,
+    windows: Windows, *, test: float = 0.2, validation: float = 0.2, seed: int = 0
 ) -> tuple[Windows, Windows, Windows]:
     """Return ``(train, validation, test)``, split by recording and stratified by class; those of a
     regression by recording alone. Copies of a recording lie on its side.
@@ -243,17 +238,9 @@ def split(
     % and 20 % (Section VI-C). Every class has a recording on each side, which plain stratification
     does not guarantee for small classes; a share of 0 leaves that side empty.
 
-    Args:
-        windows: to split.
-        test, validation: shares.
-        seed: draws the recordings.
-        groups: int ``[N]``, what lies on one side besides the recordings of each window, such as
-            its object or session. A test set of objects that training did not have shows what new
-            objects cost. None: nothing but copies.
-
     Raises:
-        ValueError: a share outside [0, 1), a class with too few recordings or groups, a recording
-            with two labels, other groups than one a window.
+        ValueError: a share outside [0, 1), a class with too few recordings, a recording with two
+            labels.
     """
     for name, share in (("test", test), ("validation", validation)):
         if not 0 <= share < 1:
@@ -265,10 +252,7 @@ def split(
             f"recording {windows.recording[mixed][0]} has windows of two classes: give each its own"
             " number"
         )
-    units = windows.sources if groups is None else np.asarray(groups)
-    if units.shape != windows.recording.shape:
-        raise ValueError(f"{len(windows)} windows need as many groups, got {list(units.shape)}")
-    recordings, first, inverse = np.unique(units, return_index=True, return_inverse=True)
+    recordings, first, inverse = np.unique(windows.sources, return_index=True, return_inverse=True)
     classes = of_class[first]  # of each recording
     sides = 1 + (test > 0) + (validation > 0)
     for label, count in zip(*np.unique(classes, return_counts=True), strict=True):
@@ -276,9 +260,7 @@ def split(
             found = f"class {label} has {count} recordings"
             if windows.y.ndim == 2:
                 found = f"there are {count} recordings"
-            if groups is not None:
-                found = found.replace("recordings", "groups")
-            elif len(recordings) < len(np.unique(windows.recording)):
+            if len(recordings) < len(np.unique(windows.recording)):
                 found += " (copies count once)"
             raise ValueError(f"{found}: a split into {sides} parts needs at least {sides}")
     rng = np.random.default_rng(seed)

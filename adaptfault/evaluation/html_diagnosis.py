@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Literal
 
 from adaptfault.evaluation.html_page import Picture, render, version_of
-from adaptfault.inspection.data_set import Episode
 from diagnostics import Diagnosis
 from diagnostics.decision.grouped_faults import by_group
 from diagnostics.decision.numbering import Numbering
@@ -21,14 +20,6 @@ HEADLINES: dict[Verdict, str] = {
     "watch": "Watch: single cells are faulty",
     "nothing": "Nothing to do",
 }
-
-OF_A_DATA_SET: dict[Verdict, str] = {
-    "call": "Do not train on this as it is",
-    "watch": "Train without what is named below",
-    "nothing": "Nothing to leave out",
-}
-
-_EPISODES = 30  # that are listed
 
 _TESTED = 0.5  # below this share of tested cells, a log without a fault is no proof of health
 
@@ -60,7 +51,6 @@ def write_diagnosis(
     code: int | None = None,
     notes: Sequence[str] = (),
     count_from: int = 0,
-    episodes: Sequence[Episode] | None = None,
 ) -> Path:
     """Write the page; return its path.
 
@@ -73,13 +63,19 @@ def write_diagnosis(
         notes: sentences below the verdict: a changed sensor, exchanged wires, faults that are
             handled.
         count_from: number of the first pad, row, column and cell on the page.
-        episodes: of a data set, those that are not whole; None: the log of a robot. Whoever trains
-            needs them, and no technician.
 
     Raises:
         OSError: the folder cannot be written.
     """
     state = verdict(diagnosis, code)
+    headline = HEADLINES[state]
+    if state == "watch" and diagnosis.faults and code is not None and code < diagnosis.exit_code:
+        headline = "Watch: the running version handles the faults"
+    elif state == "watch" and not diagnosis.faults:
+        untested = diagnosis.coverage.test_coverage < _TESTED
+        headline = "No fault found, but " + (
+            "most cells were not tested" if untested else "see the reason"
+        )
     return render(
         path,
         "diagnosis.html",
@@ -89,9 +85,7 @@ def write_diagnosis(
             note[0].upper() + note[1:]
             for note in (*notes, *(load.reason for load in diagnosis.static_loads))
         ],
-        headline=_headline(diagnosis, state, code, episodes is not None),
-        episodes=None if episodes is None else episodes[:_EPISODES],
-        partial=0 if episodes is None else len(episodes),
+        headline=headline,
         diagnosis=diagnosis,
         layout=diagnosis.layout,
         ordered=sorted(
@@ -104,14 +98,3 @@ def write_diagnosis(
         date=datetime.now().astimezone().strftime("%Y-%m-%d %H:%M %Z"),
         versions=f"adaptfault {version_of('adaptfault')}",
     )
-
-
-def _headline(diagnosis: Diagnosis, state: Verdict, code: int | None, of_data_set: bool) -> str:
-    handled = code is not None and code < diagnosis.exit_code
-    if state == "watch" and diagnosis.faults and handled and not of_data_set:
-        return "Watch: the running version handles the faults"
-    if state == "watch" and not diagnosis.faults:
-        untested = diagnosis.coverage.test_coverage < _TESTED
-        reason = "most cells were not tested" if untested else "see the reason"
-        return f"No fault found, but {reason}"
-    return OF_A_DATA_SET[state] if of_data_set else HEADLINES[state]

@@ -39,41 +39,6 @@ _JITTER = 0.2  # of the period: times say less about lost frames from here on
 _LISTED = 5
 
 
-@dataclass(frozen=True)
-class Episode:
-    """A recording with readings that nobody should train on.
-
-    Attributes:
-        name: of the recording.
-        share: of its readings that are not valid, 0..1.
-        cells: number of cells with such readings.
-    """
-
-    name: str
-    share: float
-    cells: int
-
-
-def not_whole(
-    masks: Iterable[NDArray[np.bool_]], names: Sequence[str], layout: SensorLayout
-) -> list[Episode]:
-    """Return the recordings with readings that are not valid, the worst first.
-
-    Args:
-        masks: bool ``[T, D]`` of each, as
-            :func:`~adaptfault.data.recordings.valid.valid_masks` yields them.
-        names: of each.
-        layout: the array.
-    """
-    present = layout.present.ravel()
-    found = []
-    for name, mask in zip(names, masks, strict=True):
-        invalid = ~mask[:, present]
-        if invalid.any():
-            found.append(Episode(name, float(invalid.mean()), int(invalid.any(axis=0).sum())))
-    return sorted(found, key=lambda one: -one.share)
-
-
 @dataclass(frozen=True, eq=False)
 class DataSetCheck:
     """The health of a data set.

@@ -464,49 +464,6 @@ def test_wrong_usage_is_exit_code_3(capsys):
     assert "usage: adaptfault" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(
-    ("arguments", "usage", "said"),
-    [
-        (["train", "x", "--out", "y", "--epoch-s", "3"], "train", "; did you mean --epochs?"),
-        (["maintain", "a", "b", "c", "--zzz"], "maintain", "unrecognized arguments: --zzz"),
-        (["fleet", "maintain", "f", "--zzz"], "fleet maintain", "unrecognized arguments: --zzz"),
-        (["--zzz"], "[-h]", "unrecognized arguments: --zzz"),
-    ],
-)
-def test_wrong_usage_shows_the_usage_of_its_command(arguments, usage, said, capsys):
-    with pytest.raises(SystemExit) as stop:
-        main(arguments)
-    assert stop.value.code == 3
-    told = capsys.readouterr().err
-    assert told.startswith(f"usage: adaptfault {usage}")
-    assert said in told
-
-
-def test_every_command_takes_q_and_v_and_v_shows_where_an_error_comes_from(capsys, tmp_path):
-    for name in BUILT_IN:
-        for command in (["fleet", "maintain"],) if name == "fleet" else ([name],):
-            with pytest.raises(SystemExit):
-                main([*command, "--help"])
-            options = capsys.readouterr().out
-            assert "-q, --quiet" in options
-            assert "-v, --verbose" in options
-    (tmp_path / "empty.csv").write_text("")
-    assert main(["info", str(tmp_path / "empty.csv"), "-q"]) == 3
-    assert "Traceback" not in capsys.readouterr().err
-    assert main(["info", str(tmp_path / "empty.csv"), "-v"]) == 3
-    assert "Traceback" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("shell", ["bash", "zsh", "tcsh"])
-def test_completions_of_a_shell_name_every_command_and_its_options(shell, capsys):
-    pytest.importorskip("shtab")
-    with pytest.raises(SystemExit) as stop:
-        main(["--print-completion", shell])
-    assert stop.value.code == 0
-    printed = capsys.readouterr().out
-    assert all(name in printed for name in [*BUILT_IN, "survival", "--untested-code"])
-
-
 def numeric_options(
     parser: argparse.ArgumentParser, command: tuple[str, ...] = ()
 ) -> Iterator[tuple[str, ...]]:

@@ -208,18 +208,3 @@ def test_a_copy_lies_on_the_side_of_its_recording_in_every_split(grasps):
     few = make_windows([originals[0], originals[0], originals[1]], [0, 0, 0], grasps.layout)
     with pytest.raises(ValueError, match=r"class 0 has 2 recordings \(copies count once\)"):
         split(few)
-
-
-def test_groups_keep_the_recordings_of_an_object_on_one_side(grasps):
-    recordings = grasps.frames[:24]
-    windows = make_windows(recordings, np.arange(24) % 2, grasps.layout)
-    objects = windows.recording // 2 * 2 % 8 + windows.y  # eight, of three recordings each
-    sides = [
-        set(objects[np.isin(windows.recording, part.recording)].tolist())
-        for part in split(windows, groups=objects)
-    ]
-    assert sorted(number for side in sides for number in side) == list(range(8))
-    with pytest.raises(ValueError, match="class 0 has 1 groups: a split into 3 parts"):
-        split(windows, groups=windows.y)
-    with pytest.raises(ValueError, match="240 windows need as many groups"):
-        split(windows, groups=[1, 2])

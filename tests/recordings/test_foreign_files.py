@@ -7,6 +7,8 @@ import os
 import numpy as np
 import pytest
 import scipy.io
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
 from recording_files import messages, refusal
 
 from adaptfault.data.recordings import load
@@ -211,28 +213,59 @@ def test_cells_by_frames_are_turned_where_the_shape_tells_and_it_is_said(tmp_pat
         assert "time as its last axis" in messages(loaded, "warning")[0]
 
 
-@pytest.mark.parametrize("width", [2, 10, 24])
-@pytest.mark.parametrize("suffix", [".parquet", ".h5", ".mat", ".zarr", ".npz"])
-def test_a_file_of_another_width_is_left_out_and_the_good_one_is_read(suffix, width, tmp_path):
-    table(tmp_path / "good.parquet", tactile=lists(X))
-    path = tmp_path / f"other{suffix}"
-    other = np.ones((20, width), np.float32)
-    match suffix:
+def write_frames(path, frames):
+    """Write frames ``[T, D]`` into a file of the format that its name ends in."""
+    match path.suffix:
         case ".parquet":
-            table(path, tactile=lists(other))
+            table(path, tactile=lists(frames))
         case ".h5":
             with h5py.File(path, "w") as file:
-                file["tactile"] = other
+                file["tactile"] = frames
         case ".mat":
-            scipy.io.savemat(path, {"tactile": other})
+            scipy.io.savemat(path, {"tactile": frames})
         case ".zarr":
-            zarr.open_group(path, mode="w").create_array("tactile", data=other)
+            zarr.open_group(path, mode="w").create_array("tactile", data=frames)
         case ".npz":
-            np.savez(path, frames=other)
-    loaded = check(tmp_path)
+            np.savez(path, frames=frames)
+        case ".npy":
+            np.save(path, frames)
+        case ".jsonl":
+            lines = [json.dumps({"tactile": frame}) for frame in frames.astype(float).tolist()]
+            path.write_text("\n".join(lines) + "\n")
+        case ".csv":
+            np.savetxt(path, frames, delimiter=",", fmt="%g")
+
+
+FORMATS = [".parquet", ".h5", ".mat", ".zarr", ".npz", ".npy", ".jsonl", ".csv"]
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    other=st.sampled_from(FORMATS),
+    good=st.sampled_from(FORMATS),
+    rows=st.integers(1, 5),
+    cols=st.integers(1, 5),
+    width=st.integers(1, 30),
+    frames=st.integers(2, 20),
+    before=st.booleans(),
+)
+def test_a_file_of_any_other_width_is_left_out_beside_any_shape_in_any_format(
+    other, good, rows, cols, width, frames, before, tmp_path_factory
+):
+    cells = rows * cols
+    assume(width != cells)
+    assume(frames != cells)  # cells x frames, which is read so
+    folder = tmp_path_factory.mktemp("widths")
+    rng = np.random.default_rng(width)
+    written = rng.integers(1, 90, (40, cells)).astype(np.float32)
+    write_frames(folder / f"m_good{good}", written)
+    odd = rng.integers(1, 90, (frames, width)).astype(np.float32)
+    write_frames(folder / f"{'a' if before else 'z'}_odd{other}", odd)
+    loaded = load(folder, shape=(rows, cols), full_scale=100)
+    np.testing.assert_array_equal(np.concatenate(loaded.recordings.frames), written)
     (told,) = messages(loaded, "error")
-    assert f"other{suffix}" in told
-    assert f"{width} values a frame, expected 12" in told
+    assert f"_odd{other}" in told
+    assert f"{width} value{'s' * (width != 1)} a frame" in told
 
 
 def test_lists_of_different_lengths_are_refused_with_their_row(tmp_path):

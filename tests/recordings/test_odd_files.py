@@ -52,6 +52,8 @@ def test_an_episode_without_frames_is_left_out_wherever_it_stands(suffix, which,
     held = [one.reshape(len(one), -1) for one in recordings if len(one)]
     np.testing.assert_array_equal(np.stack(loaded.recordings.frames), held)
     (told,) = messages(loaded, "error")
+    called = "recording" if suffix == ".npz" else "demo_"
+    assert f"{called} {which}".replace("_ ", "_") in told
     assert "holds no frames" in told
 
 

@@ -185,7 +185,11 @@ class Content:
         """
         if self.text:
             return "" if frame is None else f"line {frame}"
-        parts = [f"recording {recording}"] if len(self.recordings) > 1 else []
+        held = self.recordings[recording]
+        called = f"recording {recording}"
+        if held.arrays and held.name is not None:  # as a data set calls it
+            called = held.name.removeprefix(f"{self.path.name}, ")
+        parts = [called] if len(self.recordings) > 1 else []
         return ", ".join(parts if frame is None else [*parts, f"frame {frame}"])
 
     def error(self, what: str, recording: int = 0, frame: int | None = None) -> InputError:

@@ -40,7 +40,8 @@ def is_time_last(path: Path, arrays: Mapping[str, Array], shape: Shape | None) -
         return False
     cells = math.prod(shape)
     rest = sum(math.prod(one[1:]) for one in sizes)
-    has_windows = len(sizes) == 1 and rest % cells == 0 and sizes[0][1] == rest // cells
+    is_one = len(sizes) == 1 and len(sizes[0]) > 2
+    has_windows = is_one and rest % cells == 0 and sizes[0][1] == rest // cells
     is_recordings = len(sizes[0]) > 2 and math.prod(sizes[0][2:]) == cells
     is_first = rest == cells or has_windows or is_recordings
     return sum(math.prod(one[:-1]) for one in sizes) == cells and not is_first

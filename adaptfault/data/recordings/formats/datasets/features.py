@@ -180,7 +180,8 @@ class Pads:
         total = sum(map(math.prod, sizes))
         cells = math.prod(given) if given else total
         fitting = given if cells == total else None
-        is_windowed = len(sizes) == 1 and cells < total == cells * sizes[0][0]
+        is_one = len(sizes) == 1 and len(sizes[0]) > 1
+        is_windowed = is_one and cells < total == cells * sizes[0][0]
         if is_windowed:
             return cls((sizes[0][1:],), sizes[0][0], given)
         is_flat = all(len(size) == 1 for size in sizes) if len(sizes) == 1 else total == len(sizes)

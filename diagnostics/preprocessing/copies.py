@@ -12,6 +12,7 @@ Recordings in which nothing moves are no copies: healthy cells at rest read the 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from hashlib import sha256
 from typing import Any
 
 import numpy as np
@@ -31,6 +32,7 @@ _AGREE = 0.9  # share of the loaded readings of a frame that agree in a copy
 _DIFFERS = 0.2
 _DIFFERS_SHORT = 0.1  # in fewer frames than that: short recordings are like each other by chance
 _SHORT = 30
+_KEPT = 50_000_000  # readings whose distance from rest is kept in memory: a size
 _FEWEST = 64  # loaded readings, in so many frames at least:
 _FRAMES = 4
 _OVERLAP = 0.5  # of the shorter recording
@@ -49,14 +51,13 @@ def find_copies(recordings: Sequence[Floats]) -> NDArray[np.intp]:
     kept = [i for i in range(n) if len(recordings[i]) >= _FRAMES]
     if len(kept) < 2:
         return own
-    loads = [np.empty((0, 0), np.float32) for _ in own]
-    rest = _rest([recordings[i] for i in kept])
-    for i in kept:
-        loads[i] = np.nan_to_num(recordings[i] - rest, posinf=0, neginf=0).astype(np.float32)
-    tolerance = _tolerance([loads[i] for i in kept])
-    pairs = _pairs(loads, kept, tolerance)
-    links = [(i, j) for i, j, shift in pairs if _same(loads[i], loads[j], shift, tolerance)]
-    links += _identical([loads[i] for i in kept], kept)
+    # what no converter sends is like nothing else
+    with np.errstate(over="ignore", invalid="ignore"):
+        loads = _Loads(recordings, kept)
+        links = _identical(loads, kept)
+        for i, j, shift in _pairs(loads, kept):
+            if _same(loads.of(i), loads.of(j), shift, loads.tolerance):
+                links.append((i, j))
     if not links:
         return own
     ones = np.ones(len(links))
@@ -68,10 +69,43 @@ def find_copies(recordings: Sequence[Floats]) -> NDArray[np.intp]:
     return np.asarray(order[first][group], np.intp)
 
 
-def _tolerance(loads: Sequence[NDArray[np.float32]]) -> float:
+class _Loads:
+    """Readings of recordings away from rest; those of a large data set, which may fill half of the
+    memory, are computed again each time.
+
+    Args:
+        recordings: ``[T, D]`` each.
+        kept: numbers of those with frames.
+    """
+
+    def __init__(self, recordings: Sequence[Floats], kept: Sequence[int]) -> None:
+        self._recordings = recordings
+        some = [recordings[i][:: max(1, len(recordings[i]) // 16)] for i in kept]
+        self._rest = _rest(some)
+        readings = sum(recordings[i].size for i in kept)
+        self._kept: dict[int, NDArray[np.float32]] | None = {} if readings < _KEPT else None
+        self.tolerance = _tolerance(np.concatenate([self._away(one) for one in some]).ravel())
+
+    def of(self, i: int) -> NDArray[np.float32]:
+        """Return those of a recording, ``[T, D]``; 0 where a reading is missing."""
+        if self._kept is None:
+            return self._away(self._recordings[i])
+        if i not in self._kept:
+            self._kept[i] = self._away(self._recordings[i])
+        return self._kept[i]
+
+    def frame(self, i: int, t: int) -> NDArray[np.float32]:
+        """Return those of a frame, ``[D]``."""
+        return self._away(self._recordings[i][t]) if self._kept is None else self.of(i)[t]
+
+    def _away(self, readings: Floats) -> NDArray[np.float32]:
+        away = (readings - self._rest).astype(np.float32)
+        return np.nan_to_num(away, posinf=0, neginf=0)
+
+
+def _tolerance(some: NDArray[np.float32]) -> float:
     """Return by how much a reading of a copy differs: a share of the range, or the step of the
     converter."""
-    some = np.concatenate([one[:: max(1, len(one) // 16)].ravel() for one in loads])
     values = np.unique(some)
     if len(values) < 2:
         return 1.0  # nothing moves, whatever the tolerance
@@ -81,9 +115,8 @@ def _tolerance(loads: Sequence[NDArray[np.float32]]) -> float:
     return max(_TOLERANCE * float(high - low), step, 1e-12)
 
 
-def _rest(recordings: Sequence[Floats]) -> NDArray[np.float64]:
+def _rest(some: Sequence[Floats]) -> NDArray[np.float64]:
     """Return the median reading of each cell, ``[D]``, over some frames of all recordings."""
-    some = [one[:: max(1, len(one) // 16)] for one in recordings]
     frames = np.concatenate(some).astype(np.float64)
     frames[~np.isfinite(frames)] = np.nan
     unread = np.isnan(frames).all(axis=0)
@@ -91,33 +124,32 @@ def _rest(recordings: Sequence[Floats]) -> NDArray[np.float64]:
     return np.asarray(np.nanmedian(frames, axis=0))
 
 
-def _identical(loads: Sequence[NDArray[np.float32]], kept: Sequence[int]) -> list[tuple[int, int]]:
+def _identical(loads: _Loads, kept: Sequence[int]) -> list[tuple[int, int]]:
     """Return each recording that moves with an earlier one that has the same readings."""
     first: dict[bytes, int] = {}
     links = []
-    for load, i in zip(loads, kept, strict=True):
+    for i in kept:
+        load = loads.of(i)
         if (load != load[:1]).any():
-            links.append((i, first.setdefault(load.tobytes(), i)))
+            links.append((i, first.setdefault(sha256(load.tobytes()).digest(), i)))
     return links
 
 
-def _pairs(
-    loads: Sequence[NDArray[np.float32]], kept: Sequence[int], tolerance: float
-) -> list[tuple[int, int, int]]:
+def _pairs(loads: _Loads, kept: Sequence[int]) -> list[tuple[int, int, int]]:
     """Return (i, j, shift) where a frame t of recording i reads nearly as frame t + shift of j."""
-    width = loads[kept[0]].shape[1]
+    width = loads.of(kept[0]).shape[1]
     rng = np.random.default_rng(0)
     directions = rng.choice([-1.0, 1.0], (width, _PROJECTIONS)) / np.sqrt(width)
-    projected = [loads[i] @ directions.astype(np.float32) for i in kept]
+    projected = [loads.of(i) @ directions.astype(np.float32) for i in kept]
     owner = np.repeat(np.arange(len(kept)), [len(one) for one in projected])
     place = np.concatenate([np.arange(len(one)) for one in projected])
     tree = cKDTree(np.concatenate(projected))
     found: dict[tuple[int, int], set[int]] = {}
     for k, i in enumerate(kept):
-        frames = _looked_up(loads[i], tolerance)
+        frames = _looked_up(loads.of(i), loads.tolerance)
         if not len(frames):
             continue
-        near = 4 * tolerance * np.sqrt(_PROJECTIONS)
+        near = 4 * loads.tolerance * np.sqrt(_PROJECTIONS)
         _, at = tree.query(
             projected[k][frames], k=min(_FOUND, len(owner)), distance_upper_bound=near
         )
@@ -127,7 +159,7 @@ def _pairs(
                 shifts = found.setdefault((i, j), set())
                 if j == i or len(shifts) == _PLACED:
                     continue
-                if _agree(loads[i][t], loads[j][place[hit]], tolerance):
+                if _agree(loads.frame(i, t), loads.frame(j, place[hit]), loads.tolerance):
                     shifts.add(int(place[hit]) - t)
     return [(i, j, shift) for (i, j), shifts in found.items() for shift in sorted(shifts)]
 

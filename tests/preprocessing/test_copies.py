@@ -38,3 +38,11 @@ def test_a_cut_recording_is_the_copy_of_the_whole_one_wherever_it_stands(grasps)
 def test_recordings_in_which_nothing_moves_are_no_copies(frames):
     assert find_copies([frames, frames, frames]).tolist() == [0, 1, 2]
     assert find_copies([]).tolist() == []
+
+
+def test_what_no_converter_sends_is_no_copy_and_no_warning(grasps):
+    given = [frames.astype(float) for frames in touched(grasps)[:4]]
+    given[1][::2, ::3] = -1e308
+    given[2][5] = np.inf
+    given[3][:] = np.nan
+    assert find_copies([*given, given[0][2:]]).tolist() == [0, 1, 2, 3, 0]

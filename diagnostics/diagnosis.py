@@ -54,6 +54,7 @@ from diagnostics.preprocessing.levels import (
 )
 from diagnostics.preprocessing.load import LoadDirection
 from diagnostics.preprocessing.readings import RecordingBlocks
+from diagnostics.sensor.gain import gain_of, loads_of, without_gain
 from diagnostics.sensor.rewiring import Rewiring, find_rewiring
 from diagnostics.sensor.shared import Shared, measured
 from diagnostics.sensor.swapped_in_part import SwappedInPart, find_swapped_in_part
@@ -219,6 +220,9 @@ class SelfDiagnosis:
         else:
             dead = np.where(never_moved(healthy, tolerance), suspected[self._order], 0.0)
         self.reference_ = Reference.fit(healthy, layout, dead)
+        near = self.reference_.scale.near
+        usual = loads_of(healthy, near, living(layout, dead).present.ravel())
+        self.reference_ = replace(self.reference_, loads=usual)
         if self.proof_of_life:
             self.reference_ = self.reference_.with_life(healthy, layout)
         if calibrator is None:
@@ -277,7 +281,7 @@ class SelfDiagnosis:
             return shared.diagnosis()
         log = RecordingBlocks(shared.recordings)
         with one_thread():
-            return shared.told(self.for_log(log.given)._diagnosed(log))
+            return shared.told(self.for_log(log.given)._judged(log))
 
     def for_log(
         self,
@@ -631,6 +635,45 @@ class SelfDiagnosis:
         """Return whether loads, as the stream holds them, may fall; None: nothing tells."""
         is_known = stream.load is not None or self.reference_ is not None
         return False if is_known or self.layout.rest != "learn" else None
+
+    def _judged(self, log: RecordingBlocks) -> Diagnosis:
+        """Return the diagnosis of a log, without a gain of the whole array where that explains
+        faults."""
+        found = self._diagnosed(log)
+        usual = self.without_gain(log.given) if found.faults else None
+        if usual is None:
+            return found
+        without = self._diagnosed(usual)
+        return without if without.n_lost < found.n_lost else found
+
+    def without_gain(self, recordings: ArrayLike | Sequence[ArrayLike]) -> RecordingBlocks | None:
+        """Return a log without the gain that the whole array has in it; None where it has none, or
+        none is known (:mod:`diagnostics.sensor.gain`).
+
+        Args:
+            recordings: a log, as for :meth:`diagnose`.
+
+        Raises:
+            ValueError: recordings that do not fit the layout, or hold no frame.
+        """
+        log = checked_recordings(recordings, self.layout)
+        reference = self.reference_
+        if reference is None or reference.loads is None or self.layout.axes > 1:
+            return None
+        if self.load_ is not None and self.load_.direction == "middle":
+            return None
+        valid = log.valid(self.layout.full_scale, self.layout.present.ravel())
+        loads = valid if self.load_ is None else [self.load_.loads(frames) for frames in valid]
+        scale = reference.scale
+        present = living(self._planes, reference.dead).present.ravel()
+        gain = gain_of(loads_of(loads, scale.near, present), reference.loads)
+        if gain == 1.0:
+            return None
+        usual = without_gain(loads, gain, scale.baseline)
+        if self.load_ is not None:
+            below = np.zeros(self.layout.n_cells, bool)
+            usual = [self.load_.readings(frames, below) for frames in usual]
+        return RecordingBlocks(usual)
 
     def _diagnosed(
         self, log: RecordingBlocks, needed: NDArray[np.bool_] | None = None

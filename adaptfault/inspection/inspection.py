@@ -234,6 +234,9 @@ def _judged(
     as_it_is = find_changed_readings(diagnoser, log, healthy, disturbed=disturbed)
     if common is None:
         return as_it_is, None
+    # Where all cells read more, so does what they share of a contact.
+    if not as_it_is.diagnosis.faults and diagnoser.without_gain(log) is not None:
+        return as_it_is, None
     undone = common.undo(log, diagnoser.layout)
     without = find_changed_readings(diagnoser, undone, healthy, disturbed=True)
     explanations = len(without.diagnosis.faults) + 1

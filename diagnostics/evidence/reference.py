@@ -57,6 +57,8 @@ class Reference:
         beside: lower limit of the readings of healthy cells, relative to their pad; None: unknown.
         life: how cells depend on each other; None: unknown.
         noise: what all cells have; None: unknown.
+        loads: float ``[n]``, load of each recording (:mod:`diagnostics.sensor.gain`); None:
+            unknown.
     """
 
     tolerance: float
@@ -74,6 +76,7 @@ class Reference:
     beside: PadLimit | None = None
     life: LifeModel | None = None
     noise: UsualNoise | None = None
+    loads: NDArray[np.float64] | None = None
 
     def repeats(self, layout: SensorLayout) -> Patience:
         """Return how often healthy frames repeat."""

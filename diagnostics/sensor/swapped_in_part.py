@@ -4,10 +4,11 @@ place there, and in their own place in the others.
 Each recording is scored by the log likelihood of a few contact events that load each pad most, as
 they came and under each permutation that :mod:`diagnostics.sensor.rewiring` tries. A recording
 counts as exchanged where a permutation gains 24 in it. The permutation with the largest gain over
-these recordings, 96 at least, is told, of all recordings in which it gains, if they then are as
+these recordings, 192 at least, is told, of all recordings in which it gains, if they then are as
 likely as the others are as they came, by their medians and the range of the others, and if no other
 permutation of the same cells gains nearly as much. At least one recording must contradict it by 24:
-otherwise the whole log may be so.
+otherwise the whole log may be so. Lines are exchanged in two recordings at least: one may be of an
+odd contact.
 
 Not detected: different exchanges in different recordings, and recordings that load both places
 alike.
@@ -34,7 +35,7 @@ _EVENTS = 4
 _ALL_EVENTS = 160
 _FEWEST = 4  # recordings
 # log likelihood gained, all recordings together: of many permutations and recordings, one is odd
-_PROVEN = 4 * LIMIT
+_PROVEN = 8 * LIMIT
 _LISTED = 5
 
 Floats = NDArray[np.float64]
@@ -125,7 +126,9 @@ def find_swapped_in_part(
     exchanged = gains >= LIMIT
     totals = np.where(exchanged, gains, 0.0).sum(axis=1)
     best = int(totals.argmax())
-    if totals[best] < _PROVEN:
+    of_pads = (layout.pad_of[candidates[best].source] != layout.pad_of).any()
+    # A connector may be wrong for one recording; the lines of a pad are not.
+    if totals[best] < _PROVEN or (exchanged[best].sum() < 2 and not of_pads):
         return None
     which = _exchanged(gains[best])
     others = ~which & np.isfinite(usual)

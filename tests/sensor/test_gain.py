@@ -1,0 +1,71 @@
+"""A healthy array that reads more, or less, than in the reference has another gain; no cell is
+blamed for it."""
+
+import numpy as np
+import pytest
+from conftest import without_calibration
+
+import adaptfault as af
+from diagnostics import Fault, SelfDiagnosis, SensorLayout, inject
+
+LAYOUT = SensorLayout(1, 4, 4, full_scale=1023.0, unit="count", rate=50.0)
+PLACES = np.argwhere(np.ones((4, 4)))
+
+
+def grasps(seed: int, n: int, gain: float = 1.0) -> list[np.ndarray]:
+    """Return recordings in which an object is grasped, held and let go."""
+    rng = np.random.default_rng(seed)
+    device = np.exp(np.random.default_rng(7).normal(0, 0.12, 16))
+    time = np.arange(50)[:, None]
+    found = []
+    for _ in range(n):
+        begin = rng.integers(5, 12)
+        end = rng.integers(36, 45)
+        held = np.clip(np.minimum(time - begin, end - time) / 6, 0, 1)
+        centre = rng.uniform(0, 3, 2) + rng.normal(0, 0.03, 2) * (time - begin)
+        width = rng.uniform(1, 2)
+        apart = ((PLACES - centre[:, None]) ** 2).sum(axis=2)
+        load = rng.uniform(90, 330) * held * np.exp(-apart / (2 * width**2))
+        frames = gain * device * load + rng.normal(0, 2, load.shape)
+        found.append(np.clip(np.rint(frames), 0, 1023))
+    return found
+
+
+@pytest.fixture(scope="module")
+def reference() -> list[np.ndarray]:
+    return grasps(1, 60)
+
+
+@pytest.fixture(scope="module")
+def fitted(reference) -> SelfDiagnosis:
+    with without_calibration():
+        return SelfDiagnosis(LAYOUT).fit(reference)
+
+
+@pytest.mark.parametrize("gain", [0.3, 0.6, 2.0, 3.0])
+def test_an_array_with_another_gain_is_told_and_diagnosis_and_inspection_blame_nobody(
+    fitted, reference, gain
+):
+    log = grasps(2, 20, gain)
+    found = af.inspect(log, fitted, reference=reference)
+    assert {finding.name for finding in found.findings} <= {"gain", "noise"}
+    assert "gain" in {finding.name for finding in found.findings}
+    assert not found.diagnosis.fault_set
+    assert not fitted.diagnose(log).fault_set
+
+
+def test_a_dead_cell_is_found_beside_another_gain(fitted, reference):
+    log = [
+        inject(r, [Fault("short", (5,)), Fault("open", (10,))], LAYOUT) for r in grasps(2, 20, 2)
+    ]
+    assert set(fitted.diagnose(log).fault_set) == {5, 10}
+    assert set(af.inspect(log, fitted, reference=reference).diagnosis.fault_set) == {5, 10}
+
+
+def test_a_stored_diagnosis_knows_the_usual_loads_and_one_without_them_knows_no_gain(fitted):
+    log = grasps(2, 20, 2)
+    about, arrays = fitted.state()
+    same = SelfDiagnosis.from_state(about, arrays)
+    assert same.without_gain(log) is not None
+    del about["reference"]["loads"]
+    assert SelfDiagnosis.from_state(about, arrays).without_gain(log) is None

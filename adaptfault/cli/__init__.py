@@ -14,7 +14,7 @@ from typing import Any, NoReturn
 from adaptfault import __version__
 from adaptfault.cli.options import LogAboveBars
 from adaptfault.cli.paths import check_paths
-from adaptfault.cli.streams import finish, is_unread, one_line, prepare
+from adaptfault.cli.streams import finish, is_unread, one_line, prepare, settle
 from adaptfault.data.plugins import plugins
 from adaptfault.data.shortage import is_shortage
 
@@ -135,6 +135,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run a command; returns its exit code: 0 fine, 1 degraded but handled, 2 needs a technician, 3
     unusable input."""
     prepare()
+    try:
+        return _run(argv)
+    finally:
+        settle()
+
+
+def _run(argv: Sequence[str] | None) -> int:
     parser = _parser()
     args = parser.parse_args(argv)
     if args.command is None:

@@ -12,6 +12,7 @@ import os
 import sys
 from collections.abc import Callable
 from contextlib import suppress
+from typing import Any, TextIO
 
 from adaptfault.data.printable import printable
 from adaptfault.data.shortage import is_shortage
@@ -33,6 +34,30 @@ def prepare() -> None:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
+    if sys.stderr is sys.__stderr__ and isinstance(sys.stderr, io.TextIOWrapper):
+        sys.stderr = _Messages(sys.stderr.buffer, sys.stderr.encoding)
+
+
+class _Messages(io.TextIOWrapper):
+    """Messages on stderr: what nobody reads any more ends no work."""
+
+    def __init__(self, buffer: Any, encoding: str) -> None:
+        super().__init__(buffer, encoding, "backslashreplace", line_buffering=True)
+
+    def write(self, text: str) -> int:
+        """Write, or let it vanish."""
+        try:
+            return super().write(text)
+        except OSError:
+            _discard(self)
+        return len(text)
+
+    def flush(self) -> None:
+        """Flush, or let it vanish."""
+        try:
+            super().flush()
+        except OSError:
+            _discard(self)
 
 
 def one_line(error: BaseException) -> str:
@@ -63,6 +88,16 @@ def finish(args: argparse.Namespace, code: int) -> int:
     return max(code, 1 if getattr(args, "decides", False) else 3)
 
 
+def settle() -> None:
+    """Empty stdout at the end, so that the interpreter finds nothing that cannot be written."""
+    try:
+        sys.stdout.flush()
+    except ValueError:  # closed
+        pass
+    except OSError:
+        _discard(sys.stdout)
+
+
 def is_unread(error: BaseException) -> bool:
     """Return whether an error comes from stdout, which nobody reads any more."""
     if not isinstance(error, BrokenPipeError):
@@ -70,7 +105,7 @@ def is_unread(error: BaseException) -> bool:
     try:
         sys.stdout.flush()
     except BrokenPipeError:
-        _discard()
+        _discard(sys.stdout)
         return True
     except (OSError, ValueError):
         pass
@@ -82,19 +117,19 @@ def _attempt(args: argparse.Namespace, write: Callable[[], None]) -> None:
     try:
         write()
     except BrokenPipeError:
-        _discard()
+        _discard(sys.stdout)
     except OSError as error:
         args.untold = True
-        _discard()
+        _discard(sys.stdout)
         print(
             f"adaptfault {args.command}: error: the result could not be printed: {error.strerror}",
             file=sys.stderr,
         )
 
 
-def _discard() -> None:
-    """Let what is still printed on stdout vanish."""
+def _discard(stream: TextIO) -> None:
+    """Let what is still printed on a stream vanish."""
     with suppress(OSError, ValueError):
         nowhere = os.open(os.devnull, os.O_WRONLY)
-        os.dup2(nowhere, sys.stdout.fileno())
+        os.dup2(nowhere, stream.fileno())
         os.close(nowhere)

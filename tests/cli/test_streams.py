@@ -61,6 +61,7 @@ ODD = {
     "both closed": (">&- 2>&-", {}, 0),
     "all closed": ("<&- >&- 2>&-", {}, 0),
     "full": ("> /dev/full", {}, 1),
+    "read by nobody, as stderr": ("2>&1 | true; exit ${PIPESTATUS[0]}", {}, 0),
 }
 
 

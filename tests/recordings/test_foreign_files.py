@@ -404,8 +404,8 @@ def test_the_groups_of_a_file_are_gone_through_once_each(tmp_path, monkeypatch):
     from adaptfault.data.recordings.formats.datasets import chooser
 
     steps = []
-    whole = chooser._is_vector
-    monkeypatch.setattr(chooser, "_is_vector", lambda *a: steps.append(0) or whole(*a))
+    whole = chooser.is_vector
+    monkeypatch.setattr(chooser, "is_vector", lambda *a: steps.append(0) or whole(*a))
     for count in (20, 40):
         with h5py.File(tmp_path / f"{count}.h5", "w") as file:
             for i in range(count):

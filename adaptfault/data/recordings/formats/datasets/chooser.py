@@ -17,17 +17,14 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from adaptfault.data.recordings.errors import NO_FRAMES, InputError, Problem, located
-from adaptfault.data.recordings.facts.episodes import Division, Episode, divide, numbered
+from adaptfault.data.recordings.facts.episodes import Division, Episode, numbered
 from adaptfault.data.recordings.facts.labels import natural_key
 from adaptfault.data.recordings.facts.roles import (
     COUNTERS,
@@ -39,15 +36,21 @@ from adaptfault.data.recordings.facts.roles import (
     shape_of,
     unit_of,
 )
-from adaptfault.data.recordings.formats.datasets.axes import TURNED, TimeLast, Vector, is_time_last
+from adaptfault.data.recordings.formats.datasets.axes import TURNED, is_time_last
+from adaptfault.data.recordings.formats.datasets.beside import (
+    Classes,
+    Stated,
+    given_names,
+    is_vector,
+    last_part,
+    plain_number,
+)
 from adaptfault.data.recordings.formats.datasets.contents import (
     FULL_SCALES,
     NUMBERS,
     RATES,
     TEXTS,
-    TIMES,
     UNITS,
-    Array,
     Contents,
     Opened,
     Packing,
@@ -60,58 +63,17 @@ from adaptfault.data.recordings.formats.datasets.features import (
     by_episode,
     choose,
     is_touch,
-    shown,
 )
-from adaptfault.data.recordings.recording import BLOCK, Block, Facts, Recording, Shape
+from adaptfault.data.recordings.formats.datasets.parts import Part, Readings, blocks, refused
+from adaptfault.data.recordings.recording import Facts, Recording, Shape
 
 _ENDS = ("episode_ends", "lengths", "episode_lengths")
 _INDEX = "index"
 _SHOWN = 12  # arrays in a message
 _BESIDE = ("", "data", "meta")  # groups in which arrays of the whole file stand
-_ROOM = 64 << 20  # bytes of readings that are read at once
 _MOST_CELLS = 1_000_000  # of a frame; more is damage, or an attack on the memory
 _MOST_AXES = 4  # of a frame: hands, pads, rows, columns
 _LONGEST_UNIT = 16
-
-
-@dataclass(frozen=True)
-class Stated:
-    """Names of the arrays of times and of classes, or of an attribute with the class, whole or the
-    last part; None: found by their names."""
-
-    clock: str | None = None
-    label: str | None = None
-
-
-@dataclass(frozen=True)
-class _Part:
-    """Where the frames of one recording are.
-
-    Attributes:
-        names: of its arrays, one a pad.
-        first, last: its frames in them, ``last`` excluded.
-        clock: the array of its times.
-        outer: which recording of an array ``[n, T, ...]`` it is.
-        label: its class.
-        group: the group that is this episode; "" for the file.
-        number: how the file numbers it.
-    """
-
-    names: tuple[str, ...]
-    first: int
-    last: int
-    clock: str | None = None
-    outer: int | None = None
-    label: str | None = None
-    group: str = ""
-    number: int | str | None = None
-
-    @property
-    def name(self) -> str | None:
-        """How the file calls it."""
-        if self.number is not None:
-            return f"episode {self.number}"
-        return self.group or None
 
 
 def recordings_of(
@@ -149,36 +111,14 @@ def recordings_of(
         facts = chooser.facts(usual, pads)
         found = []
         for part in parts:
-            blocks = partial(_blocks, path, opened, chooser.readings(part), pads)
+            read = partial(blocks, path, opened, chooser.readings(part), pads)
             if chooser.sizes(part) != sizes and part.last > part.first:
-                blocks = partial(_refused, path, part, chooser.sizes(part), sizes)
+                read = partial(refused, path, part, chooser.sizes(part), sizes)
             name = None if part.name is None else f"{path.name}, {part.name}"
             number = part.number if isinstance(part.number, int) else None
             row = chooser.row(part)
-            found.append(Recording(facts, blocks, name, part.label, part.names, number, row))
+            found.append(Recording(facts, read, name, part.label, part.names, number, row))
     return found
-
-
-def last_part(name: str) -> str:
-    """Return the name of an array without its groups."""
-    return name.rpartition("/")[2].lower()
-
-
-@dataclass(frozen=True)
-class _Readings:
-    """What is read of one recording.
-
-    Attributes:
-        part: where its frames are.
-        packings: of its arrays.
-        turned: whether the time is their last axis.
-        tick: unit of its times.
-    """
-
-    part: _Part
-    packings: tuple[Packing, ...]
-    turned: bool
-    tick: str | None
 
 
 class _Chooser:
@@ -201,7 +141,7 @@ class _Chooser:
         self.ends = next((name for name in arrays if last_part(name) in _ENDS), None)
         self.outer = False
         self.is_turned = False
-        aside = (*EPISODES, *LABELS, *_given(stated))
+        aside = (*EPISODES, *LABELS, *given_names(stated))
         self._beside: dict[str, list[str]] = {}
         for name in arrays:
             if last_part(name) in aside or is_clock(last_part(name)):
@@ -209,8 +149,6 @@ class _Chooser:
         self._texts: dict[str, list[str]] = {}
         self.divisions: list[Division] = []
         self.left_out = ""
-
-    # readings
 
     def episodes(self, key: str | None) -> list[tuple[str, list[str]]]:
         """Return the group of each episode, and the names of its arrays of readings."""
@@ -257,9 +195,9 @@ class _Chooser:
         if array.dtype.kind not in NUMBERS or name == self.ends:
             return False
         if len(array.shape) == 1:
-            aside = (*EPISODES, *COUNTERS, "index", *LABELS, *_given(self.stated))
+            aside = (*EPISODES, *COUNTERS, "index", *LABELS, *given_names(self.stated))
             return last not in aside and not is_clock(last)
-        return last not in _given(self.stated)
+        return last not in given_names(self.stated)
 
     def _refuse_left_out(self, key: str | None) -> None:
         """Raise the reason why an array that is meant was left out."""
@@ -276,7 +214,7 @@ class _Chooser:
             return sizes[:-1]
         return sizes[2:] if self.outer else sizes[1:]
 
-    def sizes(self, part: _Part) -> tuple[Sizes, ...]:
+    def sizes(self, part: Part) -> tuple[Sizes, ...]:
         """Return the sizes of a frame of each array of a recording.
 
         Raises:
@@ -303,7 +241,7 @@ class _Chooser:
             return math.prod(sizes[1:]) != cells and math.prod(sizes[2:]) == cells
         return len(sizes) == 5 or last_part(names[0]) in ("frames", "recordings")
 
-    def row(self, part: _Part) -> int | None:
+    def row(self, part: Part) -> int | None:
         """Return what a table calls the first row of a recording: its column ``index``, or its
         place; None where the file is no table."""
         if not self.contents.is_table:
@@ -317,14 +255,14 @@ class _Chooser:
         shape = self.contents.arrays[name].shape
         return int(shape[-1] if self.is_turned else shape[0])
 
-    def readings(self, part: _Part) -> _Readings:
+    def readings(self, part: Part) -> Readings:
         """Return what is read of a recording."""
         packings = [self._packing(name) for name in part.names]
         tick = None
         if part.clock is not None:
             units = self.contents.attributes.get(part.clock, {}).get("units")
             tick = unit_of(part.clock, units)
-        return _Readings(part, tuple(packings), self.is_turned, tick)
+        return Readings(part, tuple(packings), self.is_turned, tick)
 
     def _packing(self, name: str) -> Packing:
         try:
@@ -333,7 +271,7 @@ class _Chooser:
             what = f"{name} has the attribute {error}; expected a number other than 0"
             raise InputError.at(self.path, what) from None
 
-    def facts(self, part: _Part, pads: Pads) -> Facts:
+    def facts(self, part: Part, pads: Pads) -> Facts:
         """Return what the file states of its array, from one of its recordings."""
         contents = self.contents
         name = part.names[0]
@@ -361,7 +299,7 @@ class _Chooser:
             places=pads.places,
         )
 
-    def _told(self, part: _Part, pads: Pads) -> Iterator[Problem]:
+    def _told(self, part: Part, pads: Pads) -> Iterator[Problem]:
         """Yield warnings of what was left out, and of what was decided without being stated."""
         told = []
         if self.is_turned:
@@ -376,15 +314,13 @@ class _Chooser:
         for what in told:
             yield Problem("warning", located(self.path, what))
 
-    # episodes
-
-    def parts(self, episodes: Sequence[tuple[str, list[str]]]) -> Iterator[_Part]:
+    def parts(self, episodes: Sequence[tuple[str, list[str]]]) -> Iterator[Part]:
         """Yield the recordings in the arrays of each episode."""
         for place, (group, names) in enumerate(episodes):
             length = min(self._length(name) for name in names)
             clock = self._clock(names[0], length)
             classes = self._classes(names[0])
-            start = partial(_Part, tuple(names), clock=clock, group=group)
+            start = partial(Part, tuple(names), clock=clock, group=group)
             if self.outer:
                 frames = int(self.contents.arrays[names[0]].shape[1])
                 for i in range(length):
@@ -447,9 +383,7 @@ class _Chooser:
             stored = np.array(texts(stored))
         if stored.dtype.kind == "f" and not np.isfinite(stored).all():
             raise InputError.at(self.path, f"rows without {name}; leave them out")
-        return numbered([_plain_number(value) for value in stored]) if len(stored) else []
-
-    # times and classes
+        return numbered([plain_number(value) for value in stored]) if len(stored) else []
 
     def _near(self, name: str, wanted: Sequence[str], length: int | None = None) -> str | None:
         """Return an array in the group of ``name``, or above it: the first of the names that are
@@ -465,7 +399,7 @@ class _Chooser:
             named = {last_part(one): one for one in reversed(self._beside.get(group, []))}
             for one in wanted:
                 found = named.get(one)
-                if found and (length is None or _is_vector(arrays[found], length)):
+                if found and (length is None or is_vector(arrays[found], length)):
                     return found
         return None
 
@@ -484,7 +418,7 @@ class _Chooser:
                 is_meant = is_clock(last_part(other))
             else:
                 is_meant = f"/{other.lower()}".endswith(f"/{stated.lower()}")
-            if is_meant and other in arrays and _is_vector(arrays[other], length):
+            if is_meant and other in arrays and is_vector(arrays[other], length):
                 return other
         if stated is None or self.outer:
             return None
@@ -495,158 +429,20 @@ class _Chooser:
         told = f"--{option} {name}: holds no such array{what}; it holds {held}"
         return InputError.at(self.path, told)
 
-    def _classes(self, name: str) -> _Classes:
+    def _classes(self, name: str) -> Classes:
         """Return the classes of recordings, or of frames, beside an array of readings."""
         stated = self.stated.label
         wanted = LABELS if stated is None else (last_part(stated),)
         value = self.contents.attribute(name, wanted)
         if value is not None:
-            return _Classes(self.path, stated, common=str(value))
+            return Classes(self.path, stated, common=str(value))
         holder = self._near(name, wanted)
         if stated is not None and (holder is None or stated in self.contents.arrays):
             holder = stated
         if holder is None:
-            return _Classes(self.path, stated)
+            return Classes(self.path, stated)
         if holder not in self.contents.arrays:
             raise self._absent("label-column", str(stated), " or attribute")
         if holder not in self._texts:
             self._texts[holder] = texts(self.contents.arrays[holder][:])
-        return _Classes(self.path, stated, holder, self._texts[holder])
-
-
-@dataclass(frozen=True)
-class _Classes:
-    """The classes beside an array of readings.
-
-    Attributes:
-        path: of the file.
-        stated: the option of the user.
-        holder: the array that holds them.
-        values: one a recording, or one a frame.
-        common: the class of all.
-    """
-
-    path: Path
-    stated: str | None
-    holder: str = ""
-    values: Sequence[str] | None = None
-    common: str | None = None
-
-    def of_recording(self, place: int, count: int) -> str | None:
-        """Return the class of one of ``count`` recordings."""
-        if self.values is None:
-            return self.common
-        if len(self.values) == count:
-            return self.values[place] or None
-        if self.stated is None:
-            return None
-        what = f"{self.holder} holds {len(self.values)} classes"
-        what += "; expected one a recording, or one a frame"
-        raise InputError.at(self.path, f"--label-column {self.stated}: {what}")
-
-    def divided(self, episodes: Sequence[Episode], first: int, count: int) -> Division:
-        """Return episodes with their classes, divided where these change.
-
-        Args:
-            episodes: in their order.
-            first: place of the first of them.
-            count: of all episodes of the file.
-        """
-        frames = max((episode.last for episode in episodes), default=0)
-        if self.values is not None and len(self.values) != count and len(self.values) >= frames:
-            return divide(episodes, self.values[:frames])
-        places = range(first, first + len(episodes))
-        labels = [self.of_recording(place, count) for place in places]
-        each = zip(episodes, labels, strict=True)
-        return Division(tuple(replace(episode, label=label) for episode, label in each))
-
-
-def _given(stated: Stated) -> list[str]:
-    return [last_part(name) for name in (stated.clock, stated.label) if name is not None]
-
-
-def _is_vector(array: Array, length: int) -> bool:
-    """Return whether an array holds one number, time or text a frame."""
-    shape = tuple(map(int, array.shape))
-    return shape in ((length,), (length, 1), (1, length))
-
-
-def _plain_number(value: Any) -> int | str:
-    """Return the number of an episode; a text stays one."""
-    plain = value.item()
-    if isinstance(plain, float) and plain.is_integer():
-        return int(plain)
-    return plain if isinstance(plain, int) else str(plain)
-
-
-def _refused(
-    path: Path, part: _Part, came: Sequence[Sizes], expected: Sequence[Sizes]
-) -> Iterator[Block]:
-    """Raise that frames of one recording have other sizes than those of the others."""
-    each = [(one, other) for one, other in zip(came, expected, strict=True) if one != other]
-    one, other = each[0]
-    cells = f"{math.prod(one)} values a frame, {shown(one)}, where the others have {shown(other)}"
-    raise InputError.at(path, f"{cells}; load it apart", part.name or part.names[0])
-
-
-def _blocks(path: Path, opened: Opened, held: _Readings, pads: Pads) -> Iterator[Block]:
-    part = held.part
-    # times of rows are none of frames
-    clock = part.clock if pads.steps == 1 else None
-    wanted = [*part.names, *([] if clock is None else [clock])]
-    with opened(wanted) as contents:
-        arrays: list[Any] = [contents.arrays[name] for name in part.names]
-        if held.turned:
-            arrays = [TimeLast(array) for array in arrays]
-        if part.outer is not None:
-            arrays = [arrays[0][part.outer : part.outer + 1][0]]
-        times = None if clock is None else Vector(contents.arrays[clock])
-        for first, last in _pieces(part, arrays, pads):
-            where = f"{part.name or part.names[0]}, frames {first} to {last - 1}"
-            try:
-                values = [np.asarray(array[first:last]) for array in arrays]
-                stamps = None if times is None else np.asarray(times[first:last])
-            except InputError:
-                raise
-            # a damaged chunk raises any of a dozen kinds: the codec's, the store's, Python's
-            except Exception as error:
-                what = (
-                    f"cannot be read ({type(error).__name__}): damaged, or cut off; copy it again"
-                )
-                raise InputError.at(path, what, where) from None
-            if any(len(value) != last - first for value in values):
-                raise InputError.at(path, "is cut off; copy it again", where)
-            packed = zip(held.packings, values, strict=True)
-            frames = pads.frames([packing.unpacked(value) for packing, value in packed])
-            yield _block(path, frames, stamps, held)
-
-
-def _pieces(part: _Part, arrays: Sequence[Any], pads: Pads) -> Iterator[tuple[int, int]]:
-    """Yield first and last frame of what is read at once: about a block, but never a part of a
-    chunk, which would be unpacked again for each of its parts."""
-    row = sum(math.prod(sizes) for sizes in pads.sizes) * pads.steps * 8
-    step = max(1, min(BLOCK, _ROOM // max(row, 1)))
-    chunks = [getattr(array, "chunks", None) for array in arrays]
-    step = max([step, *(sizes[0] for sizes in chunks if sizes)])
-    for first in range(part.first, part.last, step):
-        yield first, min(first + step, part.last)
-
-
-def _block(path: Path, frames: NDArray[Any], stamps: NDArray[Any] | None, held: _Readings) -> Block:
-    """Return frames with their times; times of numpy, and written ones, count in nanoseconds."""
-    tick = held.tick
-    if stamps is None:
-        return Block(frames)
-    if stamps.dtype.kind in TEXTS:
-        try:
-            stamps = np.array(texts(stamps), dtype="datetime64[ns]")
-        except ValueError:
-            what = f"{held.part.clock} holds texts that are no times, as {texts(stamps)[0]!r}"
-            problem = Problem("warning", located(path, f"{what}: passed over"))
-            return Block(frames, problems=(problem,))
-    if stamps.dtype.kind in TIMES:
-        unset = np.isnat(stamps)
-        kind = f"{'datetime64' if stamps.dtype.kind == 'M' else 'timedelta64'}[ns]"
-        stamps = np.where(unset, np.nan, stamps.astype(kind).astype(np.int64).astype(np.float64))
-        tick = "ns"
-    return Block(frames, None, stamps.astype(np.float64), tick)
+        return Classes(self.path, stated, holder, self._texts[holder])

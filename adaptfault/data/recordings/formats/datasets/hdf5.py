@@ -20,7 +20,8 @@ from numpy.typing import NDArray
 from adaptfault.data.recordings.errors import InputError
 from adaptfault.data.recordings.facts.declared import too_large, too_much
 from adaptfault.data.recordings.formats.datasets import netcdf
-from adaptfault.data.recordings.formats.datasets.chooser import Stated, recordings_of
+from adaptfault.data.recordings.formats.datasets.beside import Stated
+from adaptfault.data.recordings.formats.datasets.chooser import recordings_of
 from adaptfault.data.recordings.formats.datasets.contents import Contents, element
 from adaptfault.data.recordings.formats.datasets.extra import imported
 from adaptfault.data.recordings.recording import Recording, Shape

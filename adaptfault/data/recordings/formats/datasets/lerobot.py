@@ -15,7 +15,8 @@ from adaptfault.data.recordings.errors import NO_FRAMES, InputError, Problem, lo
 from adaptfault.data.recordings.facts.labels import natural_key
 from adaptfault.data.recordings.facts.roles import named
 from adaptfault.data.recordings.formats.datasets import parquet
-from adaptfault.data.recordings.formats.datasets.chooser import Stated, recordings_of
+from adaptfault.data.recordings.formats.datasets.beside import Stated
+from adaptfault.data.recordings.formats.datasets.chooser import recordings_of
 from adaptfault.data.recordings.formats.datasets.extra import imported
 from adaptfault.data.recordings.formats.datasets.features import GUESSED, Pads, Sizes, choose
 from adaptfault.data.recordings.formats.text import read_json_object

@@ -14,7 +14,8 @@ import numpy as np
 from adaptfault.data.recordings.errors import InputError
 from adaptfault.data.recordings.facts.sizes import MOST_BYTES
 from adaptfault.data.recordings.formats.datasets import hdf5
-from adaptfault.data.recordings.formats.datasets.chooser import Stated, recordings_of
+from adaptfault.data.recordings.formats.datasets.beside import Stated
+from adaptfault.data.recordings.formats.datasets.chooser import recordings_of
 from adaptfault.data.recordings.formats.datasets.contents import Contents, element
 from adaptfault.data.recordings.formats.text import read_bytes
 from adaptfault.data.recordings.recording import Recording, Shape

@@ -20,7 +20,8 @@ from numpy.typing import NDArray
 from adaptfault.data.recordings.errors import InputError
 from adaptfault.data.recordings.facts.declared import too_large, too_much
 from adaptfault.data.recordings.facts.sizes import check_kind
-from adaptfault.data.recordings.formats.datasets.chooser import Stated, recordings_of
+from adaptfault.data.recordings.formats.datasets.beside import Stated
+from adaptfault.data.recordings.formats.datasets.chooser import recordings_of
 from adaptfault.data.recordings.formats.datasets.contents import Contents
 from adaptfault.data.recordings.formats.datasets.extra import imported
 from adaptfault.data.recordings.formats.datasets.features import Sizes, is_touch

@@ -22,7 +22,8 @@ import numpy as np
 
 from adaptfault.data.recordings.errors import InputError
 from adaptfault.data.recordings.facts.declared import is_regular, too_large, too_much
-from adaptfault.data.recordings.formats.datasets.chooser import Stated, recordings_of
+from adaptfault.data.recordings.formats.datasets.beside import Stated
+from adaptfault.data.recordings.formats.datasets.chooser import recordings_of
 from adaptfault.data.recordings.formats.datasets.contents import Contents
 from adaptfault.data.recordings.formats.datasets.extra import imported
 from adaptfault.data.recordings.recording import Recording, Shape

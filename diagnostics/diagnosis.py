@@ -901,7 +901,14 @@ def axis_planes(layout: SensorLayout) -> tuple[SensorLayout, NDArray[np.intp]]:
     present = layout.present.ravel()[order]
     pads = layout.pads * layout.axes
     return replace(
-        layout, pads=pads, axes=1, present=present, wiring="bus", groups=None, rest=rest
+        layout,
+        pads=pads,
+        axes=1,
+        present=present,
+        wiring="bus",
+        groups=None,
+        rest=rest,
+        names=None,
     ), order
 
 

@@ -51,6 +51,8 @@ class SensorLayout:
             ``"high"``: its upper end, and load lowers it; ``"middle"``: in between, and load moves
             it either way; ``"learn"``: whichever the healthy recordings show, ``"low"`` without
             any.
+        names: what the recordings call each cell, ``[D]``, as "L_ch10"; None: they do not. Layouts
+            with other names are equal.
 
     Raises:
         ValueError: a size below 1, a full scale or rate that is not positive, ``present`` of
@@ -69,6 +71,7 @@ class SensorLayout:
     groups: Mapping[str, Sequence[int | str]] | None = field(default=None, kw_only=True, repr=False)
     axes: int = field(default=1, kw_only=True)
     rest: Rest = field(default="learn", kw_only=True)
+    names: Sequence[str] | None = field(default=None, kw_only=True, repr=False)
 
     def __post_init__(self) -> None:
         for name in ("pads", "rows", "cols", "axes"):
@@ -110,6 +113,11 @@ class SensorLayout:
                 raise ValueError(
                     f"{name} is one of {', '.join(choices)}; got {getattr(self, name)!r}{also}"
                 )
+        if self.names is not None:
+            names = tuple(self.names)
+            if len(names) != self.n_cells or not all(map(_is_name, names)):
+                raise ValueError(f"names: expected {self.n_cells} printable texts, one a cell")
+            object.__setattr__(self, "names", names)
         if self.groups is not None:
             members_of = members(self.groups, self.n_cells)
             object.__setattr__(
@@ -209,10 +217,16 @@ class SensorLayout:
 
     def place(self, cell: int) -> str:
         """Return where a cell is, in words: "pad 0, row 4, column 5", or "triangle 7, cell 72" with
-        declared wiring.
+        declared wiring. The name that recordings give it comes behind: "pad 0, row 0, column 3
+        (L_ch3)".
 
         With several axes: "pad 0, position 24, axis 2 (cell 74)".
         """
+        name = "" if self.names is None else self.names[cell]
+        return self._place(cell) + (f" ({name})" if name else "")
+
+    def _place(self, cell: int) -> str:
+        """Return where a cell is, without its name."""
         pad, row, col = self.position(cell)
         if self.is_matrix:
             return f"pad {pad}, row {row}, column {col}"
@@ -416,6 +430,8 @@ class SensorLayout:
             d["present"] = self.present.tolist()
         if self.groups is not None:
             d["groups"] = {name: list(of) for name, of in self.groups.items()}
+        if self.names is not None:
+            d["names"] = list(self.names)
         # What differs from the default.
         return d | {
             name: getattr(self, name)
@@ -446,6 +462,7 @@ class SensorLayout:
             "rate",
             "present",
             "groups",
+            "names",
             *_DEFAULTS,
         )
         if unknown := set(d) - set(known) - {"schema"}:
@@ -491,6 +508,10 @@ class SensorLayout:
 
 
 _DEFAULTS = {"wiring": "matrix", "axes": 1, "rest": "learn"}
+
+
+def _is_name(name: object) -> bool:
+    return isinstance(name, str) and name.isprintable()
 
 
 def address_bits(wires: int) -> int:

@@ -25,7 +25,7 @@ class Numbering:
 
     Attributes:
         first: number of the first pad, row, column, position, axis and cell.
-        names: of groups, which keep their numbers ("triangle 7").
+        names: of groups and cells, which keep their numbers ("triangle 7").
     """
 
     first: int = 0
@@ -33,8 +33,9 @@ class Numbering:
 
     @classmethod
     def from_layout(cls, layout: SensorLayout, first: int) -> Numbering:
-        """Return the numbering of an array that keeps the names of its groups."""
-        return cls(first, tuple(layout.groups or ()))
+        """Return the numbering of an array that keeps the names of its groups and cells."""
+        cells = [name for name in layout.names or () if re.search(_PLACE, name, re.IGNORECASE)]
+        return cls(first, (*(layout.groups or ()), *cells))
 
     def text(self, sentence: str) -> str:
         """Return a sentence that counts from 0 with its positions counted from ``first``."""

@@ -1,11 +1,14 @@
 """The same table in several formats: the same readings, times, episodes, classes and shape."""
 
+import csv
 import json
 
 import numpy as np
 import pytest
 
+from adaptfault.cli import main
 from adaptfault.data.recordings import load
+from diagnostics.decision.numbering import Numbering
 
 rng = np.random.default_rng(0)
 
@@ -80,3 +83,47 @@ def test_a_class_that_changes_divides_a_file_or_is_told_in_every_format(tmp_path
     np.testing.assert_array_equal(
         np.concatenate(loaded.recordings.frames), readings.astype(np.float32)
     )
+
+
+@pytest.fixture
+def soles(tmp_path):
+    """Two soles of 8 channels, each with its own contacts; R_ch2 reads 0.9 throughout."""
+    time = np.arange(600)[:, None]
+    readings = np.clip(np.sin(time / rng.uniform(5, 9, 16) + rng.uniform(0, 6, 16)), 0, 1)
+    readings = (readings * 0.8 + rng.normal(0, 0.003, readings.shape)).round(4)
+    readings[:, 10] = 0.9
+    names = [f"{side}_ch{i}" for side in "LR" for i in range(8)]
+    return written(tmp_path / "soles.csv", dict(zip(names, readings.T, strict=True)))
+
+
+def test_a_cell_is_called_as_its_column_is(soles, tmp_path, capsys):
+    layout = load(soles, shape="2x2x4").recordings.layout
+    assert layout.place(10) == "pad 1, row 0, column 2 (R_ch2)"
+    assert layout == load(soles, shape="2x2x4", columns="0-15").recordings.layout
+    assert "pad 1, row 0, column 2 (R_ch2)" in str(main_out(capsys, "info", soles))
+    out = tmp_path / "out.json"
+    said = main_out(capsys, "diagnose", soles, "--count-from", "1", "--out", out)
+    assert "pad 2, row 1, column 3 (R_ch2)" in said
+    told = json.loads(out.read_text())
+    assert any("(R_ch2)" in fault["reason"] for fault in told["faults"])
+    assert told["layout"]["names"][10] == "R_ch2"
+
+
+def main_out(capsys, command, path, *options):
+    """Return what a command says of recordings of two pads of 2 x 4 cells."""
+    main([command, str(path), "--shape", "2x2x4", *map(str, options)])
+    return capsys.readouterr().out
+
+
+@pytest.mark.parametrize("name", ["cell 3", "row 7", "\x1b[2J", "<b>", "a,b" * 40])
+def test_a_name_stays_as_it_is_written_and_can_be_printed(tmp_path, name):
+    names = [name, "b", "c", "d"]
+    path = tmp_path / "a.csv"
+    with path.open("w", newline="") as file:
+        csv.writer(file).writerows([names, *rng.random((20, 4)).round(3).tolist()])
+    layout = load(path, shape="2x2").recordings.layout
+    shown = layout.names[0]
+    assert shown.isprintable()
+    assert len(shown) <= 40
+    told = Numbering.from_layout(layout, 1).text(f"{layout.place(0)} is open")
+    assert told == f"pad 1, row 1, column 1 ({shown}) is open"

@@ -58,6 +58,7 @@ class Facts:
         present: bool ``[pads, rows, cols]``, False = no sensing element.
         full_scale, unit, rate: as in SensorLayout.
         declared: those of :data:`DECLARED` that the file gives, as in SensorLayout.
+        names: what the file calls each cell; empty where it does not.
         stored: shape of the array in the file, where it holds one.
         shape_reason: what the shape was inferred from; "" where the file states it.
         inferred: one sentence for each other thing that the reader inferred, with the option that
@@ -80,6 +81,7 @@ class Facts:
     unit: str | None = None
     rate: float | None = None
     declared: Mapping[str, Any] = field(default_factory=dict)
+    names: tuple[str, ...] = ()
     stored: tuple[int, ...] = ()
     shape_reason: str = ""
     inferred: tuple[str, ...] = ()

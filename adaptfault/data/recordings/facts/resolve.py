@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from adaptfault.data.printable import printable
 from adaptfault.data.recordings.errors import InputError, Problem, located
 from adaptfault.data.recordings.facts.infer import (
     default_unit,
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
 _KEPT = "present", *DECLARED
 """What a layout states besides the shape and what the options override."""
 
+_LONGEST_NAME = 40  # letters of the name of a cell
 _SAME_RATE = 0.05
 """Rates that differ by less are the same: those of bags are measured."""
 
@@ -140,13 +142,29 @@ def resolve_layout(
         )
         known.setdefault("unit", usual)
         pads, rows, wide = shape
-        layout = SensorLayout(pads, rows, wide // known.get("axes", 1), **known)
+        names = _names(contents, math.prod(shape))
+        if isinstance(array, SensorLayout) and array.names is not None:
+            names = array.names
+        layout = SensorLayout(pads, rows, wide // known.get("axes", 1), names=names, **known)
     except (TypeError, ValueError, ZeroDivisionError) as error:
         raise InputError(f"layout: {error}; correct the option") from None
     if stated["rate"] is None:
         inferred.append(f"rate {layout.rate:g} Hz ({reason_of_rate}); otherwise give --rate")
     problems += [] if tables is not None else _contradicted(contents, layout)
     return Resolved(layout, tuple(inferred), tuple(problems))
+
+
+def _names(contents: Sequence[Content], cells: int) -> Sequence[str] | None:
+    """Return what the files call the cells; None where they do not, or not all the same."""
+    held = [_printable(c.facts.names) for c in contents if len(c.facts.names) == cells]
+    return held[0] if held and all(names == held[0] for names in held) else None
+
+
+def _printable(names: Sequence[str]) -> tuple[str, ...]:
+    """Return names as a message can hold them."""
+    return tuple(
+        " ".join(printable(name).replace(",", " ").split())[:_LONGEST_NAME] for name in names
+    )
 
 
 def _of_readers(contents: Sequence[Content]) -> list[str]:

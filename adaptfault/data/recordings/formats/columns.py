@@ -62,6 +62,7 @@ class Columns:
         unit: of the times, where it is known.
         label: of the class; None without one.
         episode: of the number of the episode; None without one.
+        names: of the readings; empty where the file has none.
         shape: ``(pads, rows, cols)`` that the names of the readings show; None: they show none.
         shape_reason: how they show it.
         inferred: what was chosen by names, with the option that states it.
@@ -75,6 +76,7 @@ class Columns:
     unit: str | None = None
     label: int | None = None
     episode: int | None = None
+    names: tuple[str, ...] = ()
     shape: Shape | None = None
     shape_reason: str = ""
     inferred: tuple[str, ...] = ()
@@ -138,7 +140,8 @@ def choose_columns(
         raise InputError.at(
             path, f"holds {held} and no readings; add one column a cell", table.first_line
         )
-    shown = shape_of([table.names[i] for i in readings]) if shape is None and table.names else None
+    names = tuple(table.names[i] for i in readings) if table.names else ()
+    shown = shape_of(names) if shape is None and names else None
     others = set(range(dialect.width)) - {*readings, roles.clock}
     return Columns(
         dialect.width,
@@ -147,6 +150,7 @@ def choose_columns(
         roles.unit,
         roles.label,
         roles.episode,
+        names,
         None if shown is None else shown[0],
         "" if shown is None else shown[1],
         inferred,

@@ -111,6 +111,7 @@ def open(
         shape=held.shape,
         inferred=tuple(filter(None, (*held.inferred, division.inferred))),
         shape_reason=held.shape_reason,
+        names=held.names,
         problems=(*held.problems, *lost),
     )
 

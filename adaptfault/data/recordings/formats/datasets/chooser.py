@@ -279,15 +279,15 @@ class _Chooser:
         unit = contents.attribute(name, UNITS)
         packings = self.readings(part).packings
         whole = all(contents.arrays[one].dtype.kind in "iu" for one in part.names)
-        by_name = None  # where each array is a cell
-        if self.shape is None and len(part.names) > 1 and not any(map(self._sizes, part.names)):
-            by_name = shape_of(part.names)
+        are_cells = len(part.names) > 1 and not any(map(self._sizes, part.names))
+        by_name = shape_of(part.names) if are_cells and self.shape is None else None
         told = [self.left_out, *(division.inferred for division in self.divisions)]
         return Facts(
             self.path,
             counts=whole and not any(one.is_scaled for one in packings),
             shape=pads.shape if by_name is None else by_name[0],
             shape_reason="" if by_name is None else by_name[1],
+            names=part.names if are_cells else (),
             present=pads.present,
             full_scale=contents.positive(name, FULL_SCALES),
             unit=unit if isinstance(unit, str) and 0 < len(unit) <= _LONGEST_UNIT else None,

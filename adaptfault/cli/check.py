@@ -6,7 +6,7 @@ import argparse
 import json
 from functools import partial
 from itertools import islice
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from adaptfault.cli.inspecting import add_reference, inspect_log, text_of, write_page
 from adaptfault.cli.options import (
@@ -24,6 +24,10 @@ from adaptfault.cli.options import (
 from adaptfault.cli.paths import Written, WrittenRecordings
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from numpy.typing import NDArray
+
     from adaptfault.data.recordings import Opened, Recordings
     from adaptfault.inspection.data_set import DataSetCheck
     from adaptfault.inspection.inspection import Inspection
@@ -110,9 +114,16 @@ def _part(text: str, log: Opened) -> Recordings:
 
 def _checked(args: argparse.Namespace, log: Opened, inspection: Inspection) -> DataSetCheck:
     from adaptfault.inspection.data_set import DataSetCheck, starts_and_tares
+    from diagnostics.preprocessing.readings import RecordingBlocks
+    from diagnostics.sensor.shared import measured
 
     summary = summary_of(log)
-    begun, tared = starts_and_tares(lambda: iter(log), log.names, log.layout)
+
+    def recordings() -> Iterator[NDArray[Any]]:
+        for frames in log:
+            yield from measured(RecordingBlocks([frames]), log.layout)
+
+    begun, tared = starts_and_tares(recordings, log.names, log.layout)
     return DataSetCheck(inspection, summary, log.clock, getattr(args, "left_out", 0), begun, tared)
 
 

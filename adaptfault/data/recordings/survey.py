@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +15,12 @@ from numpy.typing import NDArray
 from adaptfault.data.recordings.errors import NO_FRAMES, InputError, Problem
 from adaptfault.data.recordings.facts.rates import Elapsed
 from adaptfault.data.recordings.recording import Block, Facts, Recording, Shape
+from diagnostics import SensorLayout
+from diagnostics.preprocessing.levels import LOW
+from diagnostics.sensor.odd_frames import find_odd_frames
 
+_FEW = 8  # frames, that tell no corrupt one from the others
+_FAR = 1.5  # times what most frames read at most
 _HEAD = 100  # first frames of a recording, for messages
 _COUNTS = 16  # whole numbers that reach it are counts, in an array of decimals, too
 _SAMPLE = 2000  # readings of a recording, in which the step of a converter is looked for
@@ -70,7 +76,8 @@ class Survey:
             for name in ("missing", "infinite", "first_missing", "first_infinite"):
                 setattr(self, name, np.zeros(values.shape[1], np.int64))
         whole_type = values.dtype.kind in "iu"
-        finite = values if whole_type else values[np.isfinite(values)]
+        measured = _measured(values)
+        finite = measured if whole_type else measured[np.isfinite(measured)]
         positive = finite[finite > 0]
         self.largest = max(self.largest, float(positive.max(initial=0)))
         self.loaded += positive.size
@@ -100,6 +107,18 @@ class Survey:
         new = counts[cells] == 0
         getattr(self, f"first_{name}")[cells[new]] = places[new]
         counts[cells] += gaps[:, cells].sum(axis=0)
+
+
+def _measured(values: NDArray[Any]) -> NDArray[Any]:
+    """Return frames ``[t, D]`` without corrupt ones, where some read far more than most do: they
+    say nothing of the range."""
+    if len(values) < _FEW or not values.shape[1]:
+        return values
+    highest = np.nan_to_num(np.fmax.reduce(values, axis=1), posinf=0.0)
+    if not highest.max() > _FAR * np.quantile(highest, 1 - 2 * LOW):
+        return values
+    odd = find_odd_frames([values], SensorLayout(1, 1, values.shape[1]))
+    return np.delete(values, [one.frame for one in odd if one.kind == "corrupt"], axis=0)
 
 
 @dataclass(frozen=True, eq=False)

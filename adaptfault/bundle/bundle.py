@@ -8,7 +8,7 @@ import os
 import re
 import shutil
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import AbstractContextManager, suppress
 from dataclasses import replace
 from datetime import datetime, timezone
@@ -33,8 +33,7 @@ from adaptfault.bundle.parts import Parts, split_validation
 from adaptfault.bundle.pointer import NAME as POINTER
 from adaptfault.bundle.pointer import SCHEMA as POINTER_SCHEMA
 from adaptfault.bundle.pointer import STARTS, Pointer
-from adaptfault.bundle.signature import verify
-from adaptfault.bundle.signing import sign_bundle, sign_versions
+from adaptfault.bundle.signature import sign_versions, verify
 from adaptfault.bundle.versions import Version, Versions
 from adaptfault.data.atomic import make_folder, sync, sync_tree
 from adaptfault.data.shortage import is_shortage
@@ -206,7 +205,7 @@ class Bundle:
         )
         bundle.write_version(first, {"reason": "the fault-free model"})
         if sign is not None:
-            sign_bundle(bundle, sign)
+            bundle.sign(sign, {1})
         sync_tree(new)
         os.replace(new, path)
         sync(path.parent)
@@ -305,11 +304,30 @@ class Bundle:
             pointer = Pointer.read(self.path)
             after = pointer.deployed(number)
             if sign is not None:
-                sign_versions(self, sign, pointer.versions | after.versions)
+                self.sign(sign, pointer.versions | after.versions)
             if entry is None:
                 after.write(self.path)
             else:
                 self._switch(pointer, after, entry)
+
+    def sign(
+        self,
+        private_key: str | os.PathLike[str],
+        numbers: Collection[int],
+        *,
+        serial: int | None = None,
+    ) -> None:
+        """Sign the manifest and the versions of these numbers; see
+        :func:`~adaptfault.bundle.signature.sign_versions` for arguments and errors."""
+        self.serial = sign_versions(
+            self.path,
+            self.about,
+            self.versions,
+            private_key,
+            numbers,
+            before=self.serial,
+            serial=serial,
+        )
 
     def rollback(self) -> Version:
         """Return to the previous version. The fault set of the rejected one is not deployed again.

@@ -4,12 +4,14 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from adaptfault.bundle.versions import Untrusted
+from adaptfault.bundle.checksummed_json import Damaged
+from adaptfault.bundle.versions import Untrusted, Versions
+from adaptfault.data.atomic import atomic_write
 from adaptfault.data.recordings.facts.sizes import check_file
 
 if TYPE_CHECKING:
@@ -129,3 +131,62 @@ def _verifies(key: Ed25519PublicKey, signature: bytes, data: bytes) -> bool:
 def canonical(signed: dict[str, Any]) -> bytes:
     """Return the bytes that are signed."""
     return json.dumps(signed, sort_keys=True, allow_nan=False).encode()
+
+
+def sign_versions(
+    folder: Path,
+    manifest: dict[str, Any],
+    versions: Versions,
+    private_key: str | PathLike[str],
+    numbers: Collection[int],
+    *,
+    before: int,
+    serial: int | None,
+) -> int:
+    """Sign the manifest of a bundle and the versions of these numbers; return the serial number.
+
+    Args:
+        folder: of the bundle.
+        manifest, versions: that it holds; a version that cannot be read, or may not run, is left
+            out.
+        private_key: PEM file of an ed25519 key.
+        numbers: of the versions.
+        before: serial number that is known to be signed already.
+        serial: of this signature; None: the next one.
+
+    Raises:
+        ValueError: the key is none, or the serial number is not larger than all before.
+        Damaged: the file of the signature holds none.
+    """
+    key = read_private_key(private_key)
+    path = folder / NAME
+    before = max(before, _serial(path))
+    serial = before + 1 if serial is None else serial
+    if serial <= before:
+        raise ValueError(
+            f"serial number {serial}: expected more than {before}, which is signed already"
+        )
+    digests = {}
+    for number in sorted(numbers):
+        try:
+            digests[str(number)] = versions[number].digest
+        except (FileNotFoundError, Damaged):  # it does not run either
+            continue
+    signed = {"schema": SCHEMA, "serial": serial, "manifest": manifest, "versions": digests}
+    document = {"signed": signed, "signature": key.sign(canonical(signed)).hex()}
+    atomic_write(path, json.dumps(document, indent=1, allow_nan=False).encode())
+    return serial
+
+
+def _serial(path: Path) -> int:
+    """Return the serial number in a file of a signature; 0 where there is none.
+
+    Raises:
+        Damaged: the file holds no signature.
+    """
+    try:
+        return int(json.loads(path.read_bytes())["signed"]["serial"])
+    except FileNotFoundError:
+        return 0
+    except (ValueError, TypeError, KeyError, RecursionError):
+        raise Damaged(f"{path} holds no signature; remove it, and sign the bundle again") from None

@@ -2,19 +2,10 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Collection
 from os import PathLike
-from pathlib import Path
-from typing import TYPE_CHECKING
 
-from adaptfault.bundle.checksummed_json import Damaged
+from adaptfault.bundle.bundle import Bundle
 from adaptfault.bundle.pointer import Pointer
-from adaptfault.bundle.signature import NAME, SCHEMA, canonical, read_private_key
-from adaptfault.data.atomic import atomic_write
-
-if TYPE_CHECKING:
-    from adaptfault.bundle.bundle import Bundle
 
 
 def sign_bundle(
@@ -40,49 +31,4 @@ def sign_bundle(
             is not larger than the one that is signed.
         Damaged: the pointer to the active version cannot be read.
     """
-    numbers = Pointer.read(bundle.path).versions
-    sign_versions(bundle, private_key, numbers, serial=serial)
-
-
-def sign_versions(
-    bundle: Bundle,
-    private_key: str | PathLike[str],
-    numbers: Collection[int],
-    *,
-    serial: int | None = None,
-) -> None:
-    """Sign the manifest of a bundle and the versions of these numbers; see
-    :func:`sign_bundle`."""
-    key = read_private_key(private_key)
-    path = bundle.path / NAME
-    before = max(bundle.serial, _serial(path))
-    serial = before + 1 if serial is None else serial
-    if serial <= before:
-        raise ValueError(
-            f"serial number {serial}: expected more than {before}, which is signed already"
-        )
-    versions = {}
-    for number in sorted(numbers):
-        try:
-            version = bundle.versions[number]
-            versions[str(version.number)] = version.digest
-        except (FileNotFoundError, Damaged):  # it does not run either
-            continue
-    signed = {"schema": SCHEMA, "serial": serial, "manifest": bundle.about, "versions": versions}
-    document = {"signed": signed, "signature": key.sign(canonical(signed)).hex()}
-    atomic_write(path, json.dumps(document, indent=1, allow_nan=False).encode())
-    bundle.serial = serial
-
-
-def _serial(path: Path) -> int:
-    """Return the serial number in a file of a signature; 0 where there is none.
-
-    Raises:
-        Damaged: the file holds no signature.
-    """
-    try:
-        return int(json.loads(path.read_bytes())["signed"]["serial"])
-    except FileNotFoundError:
-        return 0
-    except (ValueError, TypeError, KeyError, RecursionError):
-        raise Damaged(f"{path} holds no signature; remove it, and sign the bundle again") from None
+    bundle.sign(private_key, Pointer.read(bundle.path).versions, serial=serial)

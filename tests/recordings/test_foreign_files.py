@@ -3,6 +3,7 @@ reason is told."""
 
 import json
 import os
+import zipfile
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from recording_files import messages, refusal
 
-from adaptfault.data.recordings import load
+from adaptfault.data.recordings import load, open_recordings
 
 h5py = pytest.importorskip("h5py")
 pa = pytest.importorskip("pyarrow")
@@ -423,3 +424,15 @@ def test_a_large_chunk_is_unpacked_once(tmp_path):
     )
     assert array.chunks[0] > 4096
     check(tmp_path / "a.zarr", expected=values)
+
+
+def test_archives_are_read_in_turns(tmp_path):
+    for name, values in (("a", X[:20]), ("b", X[20:])):
+        zarr.open_group(tmp_path / name, mode="w").create_array("tactile", data=values)
+        with zipfile.ZipFile(tmp_path / f"{name}.zarr.zip", "w") as archive:
+            for file in sorted((tmp_path / name).rglob("*")):
+                archive.write(file, file.relative_to(tmp_path / name))
+    paths = [tmp_path / f"{name}.zarr.zip" for name in "ab"]
+    opened = open_recordings(paths, layout=GRID, room=0)
+    for _ in range(2):
+        np.testing.assert_array_equal(np.concatenate(list(opened)), X)

@@ -76,37 +76,41 @@ def open(
 def _opened(
     path: Path, held: dict[str, _Checked], names: Sequence[str] | None
 ) -> Iterator[Contents]:
-    """Open a store; arrays of a folder stay open in ``held``."""
-    if names is not None and all(name in held for name in names):
+    """Open a store; its arrays stay in ``held``, where each recording finds its own."""
+    if names is not None:
+        _keep_open(held[names[0]].archive)
         yield Contents({name: held[name] for name in names})
         return
     zarr = imported("zarr", path)
-    archive = None
+    contents = Contents()
     try:
-        archive = None if path.is_dir() else zarr.storage.ZipStore(path, mode="r")
-        store = path if archive is None else archive
-        contents = Contents()
-        if names is not None:
-            for name in names:
-                place = "" if name == path.stem and _is_array(path) else name
-                contents.arrays[name] = _array(zarr, store, path, place)
-        elif archive is None:
+        if path.is_dir():
             _collect_folder(zarr, path, contents)
         else:
+            archive = zarr.storage.ZipStore(path, mode="r")
             _collect_archive(zarr, path, archive, contents)
+            _keep_open(archive)
     except InputError:
         raise
     # a damaged store raises any of a dozen kinds: zarr's, zipfile's, JSON's
     except Exception as error:
         what = f"is no Zarr store, or is damaged ({type(error).__name__}); copy it again"
         raise InputError.at(path, what) from None
-    if archive is None:
-        held.update({n: one for n, one in contents.arrays.items() if isinstance(one, _Checked)})
-    try:
-        yield contents
-    finally:
-        if archive is not None:
-            archive.close()
+    held.update({n: one for n, one in contents.arrays.items() if isinstance(one, _Checked)})
+    yield contents
+
+
+_OPEN: list[Any] = []  # the archive that was used last
+
+
+def _keep_open(archive: Any) -> None:
+    """Close the archive that was used before another: zarr opens it again where it is read, which
+    takes long where it has many entries."""
+    if archive is None or archive in _OPEN:
+        return
+    for other in _OPEN:
+        other.close()
+    _OPEN[:] = [archive]
 
 
 def _is_array(folder: Path) -> bool:
@@ -217,6 +221,7 @@ class _Checked:
     def __init__(self, stored: Any, store: Path) -> None:
         self._stored = stored
         self._folder = store / stored.path if store.is_dir() else None
+        self.archive = None if store.is_dir() else stored.store_path.store
         self.shape: tuple[int, ...] = tuple(map(int, stored.shape))
         self.dtype: np.dtype[Any] = stored.dtype
         self.chunks: tuple[int, ...] = getattr(stored, "shards", None) or stored.chunks

@@ -341,8 +341,8 @@ def open_recordings(
     Args:
         room: bytes of frames that are kept in memory; None: all.
         progress: receives the number of frames of each block of the first reading.
-        paths, layout, shape, labels, frames, calibration, full_scale, unit, rate, strict, targets,
-            stated: as for :func:`load`.
+        paths, layout, shape, labels, frames, calibration, full_scale: as for :func:`load`.
+        unit, rate, strict, targets, stated: as for :func:`load`.
 
     Raises:
         InputError: as :func:`load`.

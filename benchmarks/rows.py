@@ -559,7 +559,7 @@ def gain(bench: Bench) -> Iterator[Count]:
         told = kind_of_cells(diagnosis.faults)
         for cell, case in cases.items():
             drawn[case] += 1
-            named[case] += told.get(cell) is FaultKind.DRIFT
+            named[case] += told.get(cell) in (FaultKind.DRIFT, FaultKind.WEAK)
         false += len(diagnosis.fault_set - set(cases))
     for case in sorted(drawn):
         yield Count(f"{case}: found and named", named[case], drawn[case])

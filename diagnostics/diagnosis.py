@@ -743,6 +743,8 @@ class SelfDiagnosis:
         # a constant run tells more: its value, its onset; but not of a wire that comes and goes
         on_wire = judged & clear & (life.wire >= 0)
         by_life = judged & (refuted > stuck) & (stuck < MAJORITY) | on_wire
+        # at rest, a cell that reads little of its load holds a value
+        by_life |= judged & np.isfinite(life.gain)
         probability = np.where(
             present, np.where(certain, _CERTAIN, np.maximum(stuck, refuted)), 0.0
         )
@@ -764,7 +766,14 @@ class SelfDiagnosis:
         told = np.where(unsure, life.kind, kind)
         source = np.where(life.source < 0, np.nan, self._order[life.source])
         of_life = np.stack(
-            [held, stream.reading(stream.scale.baseline), life.lag * PIECE, source, life.highest]
+            [
+                held,
+                stream.reading(stream.scale.baseline),
+                life.lag * PIECE,
+                source,
+                life.highest,
+                life.gain,
+            ]
         )
         weight = log_ratio(spatial.surprisal, spatial.surprisal)
         return CellFindings(
@@ -778,7 +787,7 @@ class SelfDiagnosis:
             intermittent=intermittent,
             noisy=noisy,
             drifting=drifting,
-            gain=np.where(drifting, spatial.factor, np.nan),
+            gain=np.where(drifting, spatial.factor, life.gain),
             value=np.where(
                 told >= 0,
                 of_life[told, np.arange(len(kind))],

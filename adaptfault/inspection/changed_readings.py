@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from diagnostics import Diagnosis, FaultKind, FaultSet, SelfDiagnosis
+from diagnostics.preprocessing.levels import LEAST_LOADED
 from diagnostics.sensor.recalibration import Recalibration, find_recalibration, recalibrated
 from diagnostics.sensor.rewiring import Rewiring
 from diagnostics.sensor.sensor_change import SensorChange, find_change
@@ -169,11 +170,15 @@ def _recalibration(
     """Return how replaced pads read; None where none is replaced."""
     if diagnoser.load_ is not None or diagnoser.reference_ is None or not healthy:
         return None
-    # Cells of a new pad have other gains and offsets, as those that drift; other faulty cells tell
-    # nothing of a pad.
-    faulty = np.zeros(diagnoser.layout.n_cells, bool)
+    # Many cells of a new pad have other gains and offsets. Other faulty cells tell nothing of it.
+    layout = diagnoser.layout
+    faulty = diagnosis.fault_set.mask.copy()
+    otherwise = np.zeros(layout.n_cells, bool)
     for fault in diagnosis.faults:
-        if fault.kind is not FaultKind.DRIFT:
-            faulty[list(fault.cells)] = True
+        otherwise[list(fault.cells)] = fault.kind in (FaultKind.DRIFT, FaultKind.WEAK)
+    for pad in range(layout.pads):
+        on = layout.present.ravel() & (layout.pad_of == pad)
+        if (on & otherwise).sum() > LEAST_LOADED * on.sum():
+            faulty[on & otherwise] = False
     held = diagnosis.statically_loaded.mask
     return find_recalibration(frames, healthy, diagnoser.reference_, diagnoser.layout, faulty, held)

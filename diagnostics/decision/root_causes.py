@@ -22,13 +22,14 @@ from diagnostics.layout import SensorLayout
 from diagnostics.preprocessing.levels import ANYWHERE, MAJORITY, SLIGHT, SUSPICIOUS
 from diagnostics.wiring import LineKind, action, counted
 
-# Of the cells that are refuted, in the order of ``evidence.life.FAULTS``.
+# Of the cells that are refuted, in the order of ``evidence.life.FAULTS``, and weak ones.
 REFUTED_KINDS = (
     FaultKind.FLOATING,
     FaultKind.INTERMITTENT,
     FaultKind.LATE,
     FaultKind.COPY,
     FaultKind.CLAMPED,
+    FaultKind.WEAK,
 )
 
 # Those that a wire has which fails now and then, as one that opens under load.
@@ -295,7 +296,8 @@ def _groups(
     value = found.value
     moving = found.intermittent | found.noisy | found.drifting | (found.refuted >= 0)
     constant = faulty & ~found.silent & ~moving
-    of_gain = found.drifting & np.isfinite(found.gain)
+    of_gain = found.drifting & (found.gain > 1)
+    weak = found.drifting & (found.gain < 1)
     groups: list[tuple[FaultKind, Mask, Mask, float | None]] = [
         (FaultKind.OPEN, faulty & found.silent, found.silent, None),
         (FaultKind.OPEN, constant & found.rests, found.rests, None),
@@ -307,6 +309,8 @@ def _groups(
     ]
     for number, kind in enumerate(REFUTED_KINDS):
         refuted = found.refuted == number
+        if kind is FaultKind.WEAK:
+            refuted |= weak
         groups.append((kind, faulty & refuted, refuted, None))
     at_an_end = found.full if found.zero is None else found.full | found.zero
     intermediate = np.flatnonzero(constant & ~found.rests & ~at_an_end)
@@ -333,6 +337,8 @@ def _fault(
         FaultKind.COPY,
         FaultKind.CLAMPED,
     )
+    if kind is FaultKind.WEAK:
+        value = float(np.median(found.gain[seen]))
     if kind in own and not found.silent[seen[0]]:
         value = float(np.median(found.value[seen]))
         if np.isnan(value):  # a copy of no single cell
@@ -382,6 +388,7 @@ _DOING = {
     FaultKind.DRIFT: "moves, but never returns to its baseline",
     FaultKind.FLOATING: "moves by itself, whatever the cells around it read",
     FaultKind.LATE: "follows the cells around it about {value:.0f} frames late",
+    FaultKind.WEAK: "reads {value:.2g} times what it should",
     FaultKind.CLAMPED: (
         "never reads more than {value:.4g} {unit}, however much the cells around it are loaded"
     ),
@@ -396,13 +403,14 @@ _CHECKS = {
     FaultKind.FLOATING: "its trace for a break: an open input picks up what is around it",
     FaultKind.LATE: "the converter and the buffer that it is read from",
     FaultKind.COPY: "the multiplexer and the order in which cells are read",
+    FaultKind.WEAK: "the cell for wear or dirt, and calibrate it again",
     FaultKind.CLAMPED: "its amplifier and supply",
 }
 
 
 def _does(fault: Fault, found: CellFindings, layout: SensorLayout) -> str:
     gain = found.gain[list(fault.cells)]
-    if fault.kind is FaultKind.DRIFT and np.isfinite(gain).any():
+    if fault.kind in (FaultKind.DRIFT, FaultKind.WEAK) and np.isfinite(gain).any():
         return (
             f"is loaded when the others are, but reads about {np.nanmedian(gain):.2g} times what it"
             " should"

@@ -196,13 +196,16 @@ def test_cells_that_move_wrongly_are_named_by_how(name: str, kind: FaultKind, re
     assert reason in fault.reason
 
 
-def test_a_changed_gain_and_an_offset_are_different_drifts():
+def test_a_lost_gain_is_a_weak_cell_and_an_offset_or_a_higher_gain_is_a_drift():
     found = moving(HEALTHY, "drifting", [*row(1, 5), 7])
     of_row, single = causes(replace(found, gain=np.where(at(row(1, 5)), 0.35, np.nan)))
-    assert (of_row.kind, of_row.line) == (FaultKind.DRIFT, Line(1, "row", 5))
+    assert (of_row.kind, of_row.line) == (FaultKind.WEAK, Line(1, "row", 5))
     assert "reads about 0.35 times what it should" in of_row.reason
     assert (single.kind, single.cells) == (FaultKind.DRIFT, (7,))
     assert "never returns to its baseline" in single.reason
+    gaining = moving(HEALTHY, "drifting", [7])
+    (higher,) = causes(replace(gaining, gain=np.full(CELLS, 2.0)))
+    assert (higher.kind, higher.cells) == (FaultKind.DRIFT, (7,))
 
 
 def test_a_loose_wire_makes_its_whole_row_blink():
@@ -359,8 +362,8 @@ def test_cells_of_a_row_that_no_longer_return_to_their_rest_level_are_no_broken_
     [([7], "pad 0, row 1, column 1 drifts: it is"), (row(1, 5), "pad 1, row 5 drifts: each of")],
 )
 def test_the_verb_of_a_sentence_fits_the_kind(cells, said):
-    weak = replace(moving(HEALTHY, "drifting", cells), gain=np.where(at(cells), 0.35, np.nan))
-    (fault,) = causes(weak)
+    higher = replace(moving(HEALTHY, "drifting", cells), gain=np.where(at(cells), 2.0, np.nan))
+    (fault,) = causes(higher)
     assert fault.reason.startswith(said)
     copied = replace(moving(HEALTHY, "noisy", [8]), noisy=NONE, refuted=np.where(at([8]), 3, -1))
     (copy,) = causes(replace(copied, value=np.where(at([8]), 9.0, np.nan)))
@@ -373,7 +376,7 @@ def test_the_verb_of_a_sentence_fits_the_kind(cells, said):
 def test_a_wire_that_possibly_drifts_may_drift():
     cells = at(row(0, 3)[2:])
     weight = np.where(cells, 3.02, 0.0)
-    gain = np.where(cells, 0.35, np.nan)
+    gain = np.where(cells, 2.0, np.nan)
     found = replace(HEALTHY, alive=~cells, drifting=cells, weight=weight, gain=gain)
     _, (possible,) = root_causes(found, (), LAYOUT)
     assert "pad 0, row 3 may drift from column 2 on" in possible.reason

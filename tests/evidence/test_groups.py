@@ -1,10 +1,11 @@
-"""Groups that fail as a whole: fingers of one bus each, which are loaded independently."""
+"""Fingers of one bus each, which are loaded independently: some fail as a whole, some are worn."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
+from adaptfault.inspection.inspection import inspect
 from diagnostics import Diagnosis, FaultKind, Line, SelfDiagnosis, SensorLayout
 
 FINGERS = 4
@@ -98,3 +99,21 @@ def test_a_finger_that_a_flat_object_presses_beyond_the_range_is_healthy(fitted)
         pressed = 500 * rise[:, None] * edge
         log[i][:, :CELLS] = np.clip(np.rint(np.maximum(log[i][:, :CELLS], pressed)), 0, 255)
     assert fitted.diagnose(log).faults == ()
+
+
+@pytest.mark.parametrize("gain", [0.03, 0.1, 0.2, 0.35])
+def test_worn_cells_are_weak_with_their_gain_and_no_pad_is_replaced(fitted, gain: float):
+    rng = np.random.default_rng(0)
+    log = recordings(30, 2)
+    worn = [8, 15]
+    for frames in log:
+        weaker = gain * frames[:, worn] + rng.normal(0, 1, (FRAMES, 2))
+        frames[:, worn] = np.clip(np.rint(weaker), 0, 255)
+    found = inspect(log, fitted, reference=recordings(60, 1))
+    assert found.recalibration is None
+    assert found.change is None
+    faults = found.diagnosis.faults
+    assert [(fault.kind, fault.cells) for fault in faults] == [
+        (FaultKind.WEAK, (cell,)) for cell in worn
+    ]
+    assert all(gain / 2.1 < fault.value < 2.1 * gain for fault in faults)

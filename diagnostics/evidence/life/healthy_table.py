@@ -21,6 +21,7 @@ Levels = NDArray[np.uint8]
 FAULTS = ("independent", "intermittent", "late", "copy", "clamped")
 COPY = FAULTS.index("copy")
 INTERMITTENT = FAULTS.index("intermittent")
+WEAK = len(FAULTS)  # what seems independent, and follows the others with a part of its load
 UNLOADED = 1e-3  # root load up to which a piece counts as unloaded
 AGAINST = 1.0  # log ratio from which on a unit speaks against a cell, or a wire
 REFUTED = 4.0  # evidence from which on a cell predicts no others

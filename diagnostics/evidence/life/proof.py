@@ -14,16 +14,19 @@ from diagnostics.evidence.life.healthy_table import (
     INTERMITTENT,
     REFUTED,
     THRESHOLD,
+    WEAK,
     Cells,
     Floats,
     Mask,
 )
 from diagnostics.evidence.life.levels_in_log import LifeLog
 from diagnostics.evidence.life.ways_to_fail import (
+    WORKS,
     EvidenceOfLog,
     Suspicion,
     WaysToFail,
     follows_otherwise,
+    responses,
 )
 from diagnostics.evidence.life.wires import FailingWires, failing_wires
 from diagnostics.evidence.stepping import finished
@@ -44,7 +47,7 @@ class Life:
 
     Attributes:
         evidence: float, log likelihood ratio of any of the faults : healthy.
-        kind: int, number of the likeliest of the ``FAULTS``.
+        kind: int, number of the likeliest of the ``FAULTS``, or ``WEAK``.
         shown: bool, the cell depends on the others as a healthy cell does.
         refuted: bool, cells that must not predict others.
         certain: bool, those of them that are faulty.
@@ -60,6 +63,8 @@ class Life:
         as_one: bool, cells that read as one with those of their wire, while it fails.
         floats: bool, certain cells that do not follow the others at all, not with a lower gain
             either.
+        gain: float, share of their load that certain cells read which follow the others; NaN:
+            other cells.
         contradicting: share of the tested cells that are refuted, where it is so large that all are
             disturbed and none is faulty; else 0.
     """
@@ -80,6 +85,7 @@ class Life:
     of_wire: Floats
     as_one: Mask
     floats: Mask
+    gain: Floats
     contradicting: float
 
     @classmethod
@@ -105,6 +111,7 @@ class Life:
             of_wire=nothing,
             as_one=no,
             floats=no,
+            gain=np.full(n_cells, np.nan),
             contradicting=0.0,
         )
 
@@ -185,7 +192,7 @@ class LifeTest:
         yield
         life = _concluded(log, ways, self._eligible, self._constant, wires)
         life = yield from _without_followers(log, ways, life)
-        return life
+        return _with_weak(log, self.known, life)
 
     def _settled(self, evidence: EvidenceOfLog, out: Mask) -> Generator[None, None, None]:
         """Yield between steps; find the cells that predict others, without those that are
@@ -240,6 +247,25 @@ def _without_followers(log: LifeLog, ways: WaysToFail, life: Life) -> Generator[
     return replace(life, evidence=evidence, floats=floats)
 
 
+def _with_weak(log: LifeLog, known: Mask, life: Life) -> Life:
+    """Return the result where certain cells that seem to float, but follow the others with less
+    than half of their load, are weak."""
+    cells = np.flatnonzero(life.floats)
+    if not len(cells):
+        return life
+    gain, z = responses(log, known)
+    usual = float(np.median(gain[known & (z > WORKS)])) if (known & (z > WORKS)).any() else np.inf
+    cells = cells[(z[cells] > WORKS) & (gain[cells] < MAJORITY * usual)]
+    kind = life.kind.copy()
+    kind[cells] = WEAK
+    floats = life.floats.copy()
+    floats[cells] = False
+    found = life.gain.copy()
+    found[cells] = gain[cells] / usual
+    since = np.where(np.isfinite(found), 0, life.since)
+    return replace(life, kind=kind, floats=floats, gain=found, since=since)
+
+
 def _concluded(
     log: LifeLog, ways: WaysToFail, eligible: Mask, constant: Mask, wires: FailingWires
 ) -> Life:
@@ -285,5 +311,6 @@ def _concluded(
         of_wire=wires.probability,
         as_one=wires.as_one,
         floats=certain & (kind == 0),
+        gain=np.full(len(evidence), np.nan),
         contradicting=contradicting,
     )

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import log_expit, logsumexp
+from scipy.special import log_expit, logsumexp, ndtri
 
 from diagnostics.evidence.life.healthy_table import (
     AGAINST,
@@ -33,7 +33,7 @@ from diagnostics.evidence.life.over_time import (
     up_to_some_unit,
 )
 from diagnostics.evidence.life.record import LifeRecord
-from diagnostics.preprocessing.levels import MAJORITY, TESTED
+from diagnostics.preprocessing.levels import CERTAIN_RATIO, MAJORITY, TESTED
 
 _LAGS = (1, 2, 3, 4)  # pieces
 # Gain and offset, as a share of full scale, of a cell that reads otherwise than it did, but follows
@@ -48,6 +48,7 @@ _MOST_PASSES = 4  # a size
 _KEPT = 3  # answers: a size
 # P(distance from the mean beside it) of a cell that reads it; dead cells beside it read otherwise.
 _AMID = (0.7, 0.15, 0.07, 0.04, 0.04)
+WORKS = float(-ndtri(np.exp(-CERTAIN_RATIO)))  # standard errors of a cell that follows the others
 _CERTAINLY_NOT = 1e3  # evidence against what is impossible
 
 
@@ -247,6 +248,27 @@ def follows_otherwise(
         evidence = from_some_unit(log.counted(changed - healthy, cells))
         best = np.maximum(best, evidence)
     return best - independent
+
+
+def responses(log: LifeLog, known: Mask) -> tuple[Floats, Floats]:
+    """Return how much the readings of each cell rise with the load that the others predict, and by
+    how many standard errors, ``[D]`` each.
+
+    Both are of the regression over the units of the log; ``known``: bool ``[D]``, cells that
+    predict others.
+    """
+    length = np.diff(np.append(log.unit_begins, len(log.loads)))[:, None]
+    load = np.add.reduceat(log.model.expected(log.loads, known) ** 2, log.unit_begins) / length
+    reading = np.add.reduceat(log.readings, log.unit_begins, dtype=np.float64) / length
+    load = load - load.mean(axis=0)
+    reading = reading - reading.mean(axis=0)  # NaN where one is missing: of no use
+    together = (load * reading).sum(axis=0)
+    own = (load**2).sum(axis=0)
+    size = np.sqrt(own * (reading**2).sum(axis=0))
+    n = log.units * log.model.independent
+    z = np.divide(together * np.sqrt(n), size, out=np.zeros(len(own)), where=size > 0)
+    gain = np.divide(together, own, out=np.zeros(len(own)), where=own > 0)
+    return gain, z
 
 
 def _late(log: LifeLog, seen: Suspicion, lag: int) -> Floats:

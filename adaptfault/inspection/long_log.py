@@ -14,6 +14,9 @@ from adaptfault.inspection.inspection import OF_CELLS, Finding, Inspection, insp
 from diagnostics import Diagnosis, SelfDiagnosis
 from diagnostics.threads import one_thread
 
+_OF_PARTS = ("one_signal", "corrupt_frame", "common_spike")
+"""Names of the findings that the diagnosis of the whole log no longer sees."""
+
 
 def inspect_parts(
     parts: Iterator[list[NDArray[Any]]],
@@ -55,6 +58,8 @@ def inspect_parts(
             for frames in one.readings.frames:
                 stream.extend(frames)
         inspected.append(_without_frames(one))
+    if not stream.received.any():  # all cells show one signal, or none has a reading
+        return inspected[0]
     return _together(inspected, fitted.evaluate(stream, n_recordings=n_recordings))
 
 
@@ -75,6 +80,6 @@ def _together(inspected: list[Inspection], diagnosis: Diagnosis) -> Inspection:
     told: dict[str, Finding] = {}
     for one in inspected:
         for finding in one.findings:
-            if finding.name not in OF_CELLS:
+            if finding.name not in OF_CELLS or finding.name in _OF_PARTS:
                 told.setdefault(finding.name, finding)
     return Inspection(readings, (*told.values(), *of_diagnosis(diagnosis)), change)

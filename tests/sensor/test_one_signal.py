@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import adaptfault as af
+from adaptfault.inspection.long_log import inspect_parts
 from diagnostics import SelfDiagnosis, SensorLayout, Verdict
 from diagnostics.preprocessing.levels import MAJORITY
 from diagnostics.sensor.one_signal import find_one_signal
@@ -66,6 +67,17 @@ def test_one_pad_of_two_is_named_and_the_other_is_judged():
     diagnosis = SelfDiagnosis(PAIR).diagnose(log)
     assert set(diagnosis.fault_set) == set(range(16, 32))
     assert diagnosis.faults[0].reason.startswith("all 16 cells of pad 1 show one signal")
+
+
+def test_of_a_log_in_parts_the_array_as_a_whole_is_told_too():
+    whole = inspect_parts(iter([[shown("noisy")], [shown("noisy", 2)]]), SelfDiagnosis(FINGER))
+    assert (names(whole), whole.severity) == (["one_signal"], 2)
+    rng = np.random.default_rng(3)
+    other = counts(40 + rng.uniform(0, 1, 16) * presses(8)[:, None] + rng.normal(0, 2, (600, 16)))
+    log = np.concatenate([other, shown("noisy")], axis=1)
+    of_pad = inspect_parts(iter([[log], [log]]), SelfDiagnosis(PAIR))
+    assert "one_signal" in names(of_pad)
+    assert not (of_pad.diagnosis.verdicts[16:] == Verdict.ALIVE).any()
 
 
 @pytest.mark.parametrize(("axis", "other"), [("row", "column"), ("column", "row")])

@@ -1,7 +1,7 @@
 """What a file of named arrays holds, whatever its format: arrays by name, attributes, and what had
 to be left out.
 
-HDF5, Zarr, MAT, netCDF and Parquet are opened as these contents; :mod:`.hierarchy` finds readings,
+HDF5, Zarr, MAT, netCDF and Parquet are opened as these contents; :mod:`.chooser` finds readings,
 times, episodes and classes in them, the same way for all.
 """
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -12,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.special import expit, logit
 
 from diagnostics.decision.address_aliasing import find_aliasing
+from diagnostics.decision.by_recording import with_recordings
 from diagnostics.decision.calibration import Calibrator, faulty_at, kinds
 from diagnostics.decision.certificate import Certificate, certify
 from diagnostics.decision.line_cover import candidate_groups
@@ -59,15 +61,18 @@ from diagnostics.sensor.rewiring import Rewiring, find_rewiring
 from diagnostics.sensor.shared import Shared, measured
 from diagnostics.sensor.swapped_in_part import SwappedInPart, find_swapped_in_part
 from diagnostics.threads import one_thread
+from diagnostics.when import OWN_REFERENCE, Held, Spans, filled, find_held, own_reference
+from diagnostics.when.reference_findings import (
+    ReferenceFinding,
+    ReferenceWarning,
+    reference_findings,
+)
 
 SCHEMA = "adaptfault.diagnoser/1"
 
 # P(faulty) of silent, intermittent, noisy and drifting cells, which have their own thresholds
 _WHOLE = 1e-6  # by which a whole number may be missed after a conversion to loads and back
 _CERTAIN = 1 - RARE
-
-# recordings from which on a log is its own reference: with a model of ten, healthy cells are blamed
-OWN_REFERENCE = 32
 
 Result = TypeVar("Result", covariant=True)
 LogRatio = Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64]]
@@ -105,6 +110,8 @@ class SelfDiagnosis:
         load_: how readings become loads; None: load raises the reading.
         copies_: int ``[n]``, of which recording each one of the reference is a copy; its own number
             where it is none. None: not fitted.
+        reference_findings_: what the reference itself shows: cells that hold a value in some of its
+            recordings although those beside them move. Nothing is learned from these readings.
     """
 
     reference_: Reference | None = None
@@ -112,6 +119,7 @@ class SelfDiagnosis:
     copies_: NDArray[np.intp] | None = None
     _certificate: Certificate | None = None
     _held_out: tuple[Sequence[NDArray[Any]], NDArray[np.float64]] | None = None
+    reference_findings_: tuple[ReferenceFinding, ...] = ()
 
     def __init__(
         self,
@@ -167,6 +175,7 @@ class SelfDiagnosis:
         recordings: ArrayLike | Sequence[ArrayLike],
         y: object = None,
         *,
+        strict: bool = False,
         progress: Callable[[float], None] = lambda share: None,
     ) -> SelfDiagnosis:
         """Fit to fault-free recordings, ``[T, D]`` or a list of them.
@@ -179,17 +188,27 @@ class SelfDiagnosis:
         Args:
             recordings: as :meth:`SensorLayout.recordings` takes them.
             y: ignored, for pipelines of scikit-learn.
+            strict: refuse a reference that shows faults in some of its recordings; else they are
+                left out, told by ``reference_findings_`` and by a warning.
             progress: receives the share of the work that is done, 0 to 1, again and again.
 
         Raises:
-            ValueError: recordings that do not fit the layout, or hold no frame with a reading.
+            ValueError: recordings that do not fit the layout, or hold no frame with a reading; with
+                ``strict``, a reference with faults.
         """
         log = checked_recordings(recordings, self.layout)
         with one_thread():
             given = measured(log, self.layout)
             self.copies_ = find_copies(given)
             independent = np.unique(self.copies_)
-            return self._fit(RecordingBlocks([given[i] for i in independent]), progress)
+            chosen = RecordingBlocks([given[i] for i in independent])
+            self._fit(chosen, progress, strict=strict)
+        self.reference_findings_ = tuple(
+            finding.among(independent.tolist()) for finding in self.reference_findings_
+        )
+        for finding in self.reference_findings_:
+            warnings.warn(finding.reason, ReferenceWarning, stacklevel=2)
+        return self
 
     def _fit(
         self,
@@ -197,6 +216,8 @@ class SelfDiagnosis:
         progress: Callable[[float], None],
         suspected: NDArray[np.float64] | None = None,
         calibrator: Calibrator | None = None,
+        *,
+        strict: bool = False,
     ) -> SelfDiagnosis:
         """Fit; ``suspected``: P(dead) ``[D]`` of cells that are dead if they never move; None:
         found here. ``calibrator``: None: fitted here."""
@@ -215,6 +236,12 @@ class SelfDiagnosis:
             layout, full_scale=min(layout.full_scale, highest_reading(healthy, layout))
         )
         tolerance = tolerance_of(healthy, layout)
+        held = find_held(Spans.of(healthy), layout, tolerance)
+        self.reference_findings_ = reference_findings(held.of(self._place), self.layout)
+        if self.reference_findings_:
+            if strict:
+                raise ValueError("; ".join(one.reason for one in self.reference_findings_))
+            healthy = filled(healthy, held, layout)
         if suspected is None:
             dead = find_reference_faults(healthy, layout, tolerance, self._diagnosed_cold)
         else:
@@ -266,8 +293,12 @@ class SelfDiagnosis:
 
         return blamed
 
-    def diagnose(self, recordings: ArrayLike | Sequence[ArrayLike]) -> Diagnosis:
+    def diagnose(
+        self, recordings: ArrayLike | Sequence[ArrayLike], *, classes: ArrayLike | None = None
+    ) -> Diagnosis:
         """Diagnose a log: recordings ``[T, D]`` or a list of them, in time order.
+
+        ``classes`` is the class of each recording, ``[n]``: a fault may show in one class only.
 
         Without :meth:`fit` (cold start), a log of 32 recordings or more is its own reference
         (:meth:`for_log`), which takes the time of a fit. In a shorter one, cells are compared with
@@ -281,7 +312,8 @@ class SelfDiagnosis:
             return shared.diagnosis()
         log = RecordingBlocks(shared.recordings)
         with one_thread():
-            return shared.told(self.for_log(log.given)._judged(log))
+            own = self.for_log(log.given, classes=classes)
+            return shared.told(own._diagnosed_when(log, classes))
 
     def for_log(
         self,
@@ -293,18 +325,17 @@ class SelfDiagnosis:
         """Return what :meth:`diagnose` judges a log with: this diagnosis, or in a cold start one
         fitted to the log.
 
-        That one is fitted to the first half of the log, so that a cell that fails in it is compared
-        with how it worked before. Cells that never move in this half, and are faulty by the cold
-        start on the whole log, are excluded and reported. A cell that fails early in this half may
-        be learned as it is, and not be found.
+        That one is fitted to recordings of the log in which no cell is suspect, half of it, the
+        first ones of each class (:mod:`diagnostics.when`). Cells that never move in them, and are
+        faulty by the cold start on the whole log, are excluded and reported. A cell that moves but
+        fails early in them may be learned as it is, and not be found.
 
         A log of fewer than 32 recordings, or in which most cells never move, is no reference: it is
         judged by this diagnosis.
 
         Args:
             recordings: a log, as for :meth:`diagnose`.
-            classes: the class of each recording, ``[n]``: of each class the first half is taken, as
-                recordings that lie class by class say nothing of other classes. None: unknown.
+            classes: the class of each recording, ``[n]``; None: unknown.
             progress: as for :meth:`fit`.
 
         Raises:
@@ -313,13 +344,30 @@ class SelfDiagnosis:
         log = checked_recordings(recordings, self.layout)
         if self.reference_ is not None or len(log) < OWN_REFERENCE:
             return self
-        first = RecordingBlocks([log.given[i] for i in _first_half(len(log), classes)])
+        held = self._held(log, tolerance_of(log, self.layout), classes)
+        first = RecordingBlocks([log.given[i] for i in own_reference(log, held, classes)])
         if not _shows_contacts(first, log, self.layout):
             return self
         own = SelfDiagnosis(**self.get_params())
         with one_thread():
             cold = self._diagnosed(log)
             return own._fit(first, progress, np.where(cold.fault_set.mask, cold.probability, 0.0))
+
+    def judge(
+        self, recordings: ArrayLike | Sequence[ArrayLike], *, classes: ArrayLike | None = None
+    ) -> tuple[ReferenceFinding, ...]:
+        """Return what recordings show as a reference, without a fit: ``reference_findings_``.
+
+        Args:
+            recordings: as for :meth:`fit`.
+            classes: the class of each recording, ``[n]``; None: unknown.
+
+        Raises:
+            ValueError: recordings that do not fit the layout.
+        """
+        log = checked_recordings(recordings, self.layout)
+        held = self._held(log, tolerance_of(log, self.layout), classes)
+        return reference_findings(held, self.layout)
 
     def rewiring(self, recordings: ArrayLike | Sequence[ArrayLike]) -> Rewiring | None:
         """Return the rows, columns or pads that answer in each other's place, None where the data
@@ -683,6 +731,32 @@ class SelfDiagnosis:
             stream.extend(frames)
         return self.evaluate(stream, n_recordings=len(log))
 
+    def _diagnosed_when(self, log: RecordingBlocks, classes: ArrayLike | None) -> Diagnosis:
+        """Return the diagnosis of a log with the recordings in which faults show."""
+        whole = self._judged(log)
+        if self.reference_ is None or len(log) < 2:
+            return whole
+        held = self._held(log, self.reference_.tolerance, classes)
+        return with_recordings(
+            whole,
+            held,
+            [len(given) for given in log.given],
+            self.reference_.tolerance,
+            lambda some: self._judged(RecordingBlocks([log.given[i] for i in some])),
+        )
+
+    def _held(self, log: RecordingBlocks, tolerance: float, classes: ArrayLike | None) -> Held:
+        """Return where cells hold a value although those beside them move."""
+        valid = log.valid(self.layout.full_scale, self.layout.present.ravel())
+        given = [np.asarray(frames, dtype=np.float64)[:, self._order] for frames in valid.given]
+        if self.load_ is not None:
+            given = [self.load_.loads(frames) for frames in given]
+        held = find_held(Spans.of(RecordingBlocks(given)), self._planes, tolerance, classes)
+        if self.load_ is not None:
+            below = np.zeros(len(held.value), bool)
+            held = replace(held, value=self.load_.readings(held.value, below))
+        return held.of(self._place)
+
     @staticmethod
     def _diagnosed_cold(
         log: RecordingBlocks,
@@ -919,15 +993,6 @@ def axis_planes(layout: SensorLayout) -> tuple[SensorLayout, NDArray[np.intp]]:
         rest=rest,
         names=None,
     ), order
-
-
-def _first_half(n: int, classes: ArrayLike | None) -> list[int]:
-    """Return the first half of n recordings, or of those of each class."""
-    if classes is None:
-        return list(range(n // 2))
-    label = np.asarray(classes)
-    each = [np.flatnonzero(label == one) for one in np.unique(label)]
-    return sorted(int(i) for of_class in each for i in of_class[: (len(of_class) + 1) // 2])
 
 
 def _shows_contacts(first: RecordingBlocks, log: RecordingBlocks, layout: SensorLayout) -> bool:

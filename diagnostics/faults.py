@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Iterable, Iterator, Mapping, Set
 from dataclasses import asdict, dataclass, field
 from enum import Enum
@@ -99,6 +100,8 @@ class Fault:
         evidence: number of independent observations of it (events that tested its cells, blinks,
             coincidences of two lines); None: known, not inferred.
         alternatives: other causes that the data permit, one sentence each.
+        recordings: numbers of the recordings in which it shows, ascending, from 0; None: in all
+            from its onset on.
     """
 
     kind: FaultKind
@@ -110,6 +113,7 @@ class Fault:
     reason: str = field(default="", kw_only=True)
     evidence: int | None = field(default=None, kw_only=True)
     alternatives: tuple[str, ...] = field(default=(), kw_only=True)
+    recordings: tuple[int, ...] | None = field(default=None, kw_only=True)
 
     if TYPE_CHECKING:  # what it takes, beside what it holds
 
@@ -125,6 +129,7 @@ class Fault:
             reason: str = "",
             evidence: int | None = None,
             alternatives: tuple[str, ...] = (),
+            recordings: tuple[int, ...] | None = None,
         ) -> None: ...
 
     def __post_init__(self) -> None:
@@ -156,6 +161,10 @@ class Fault:
         """Return a JSON-safe dict that :meth:`from_dict` reads."""
         lists = {"cells": list(self.cells), "alternatives": list(self.alternatives)}
         about = {**asdict(self), "kind": str(self.kind), **lists}
+        if self.recordings is not None:
+            about["recordings"] = list(self.recordings)
+        else:
+            del about["recordings"]
         if self.line is not None and not self.line.name:
             del about["line"]["name"]  # only groups have one
         return about
@@ -178,7 +187,14 @@ class Fault:
             if not all(isinstance(text, str) for text in alternatives):
                 raise TypeError("alternatives must be text")
             line = Line(**d["line"]) if d.get("line") else None
-            lists = {"cells": tuple(d["cells"]), "alternatives": alternatives}
+            recordings = d.get("recordings")
+            if recordings is not None:
+                recordings = tuple(operator.index(number) for number in recordings)
+            lists = {
+                "cells": tuple(d["cells"]),
+                "alternatives": alternatives,
+                "recordings": recordings,
+            }
             return cls(**{**d, "line": line, "reason": d.get("reason") or "", **lists})
         except (TypeError, KeyError, AttributeError, OverflowError) as error:
             raise ValueError(
@@ -197,6 +213,7 @@ _KINDS: Mapping[str, tuple[type, ...]] = {
     "reason": (str, _NONE),
     "evidence": (int, _NONE),
     "alternatives": (list, tuple, _NONE),
+    "recordings": (list, tuple, _NONE),
 }
 
 

@@ -6,6 +6,7 @@ import argparse
 import json
 import logging
 import sys
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
     from adaptfault.data.recordings import Loaded, Opened, Problem, Recordings
     from adaptfault.data.summary import Summary
     from diagnostics import Diagnosis, FaultSet, SelfDiagnosis, SensorLayout
+    from diagnostics.when.reference_findings import ReferenceFinding
 
 Commands = Any  # argparse's private type of subparsers
 
@@ -488,13 +490,17 @@ def progress(args: argparse.Namespace) -> bool | None:
     return False if args.quiet else None
 
 
-def fit_diagnoser(args: argparse.Namespace, recordings: Recordings) -> SelfDiagnosis:
+def fit_diagnoser(
+    args: argparse.Namespace, recordings: Recordings, *, told: bool = True
+) -> SelfDiagnosis:
     """Return the healthy model of recordings, with a bar while it is fitted.
 
     With ``--reference`` it is kept beside the reference, unless ``--no-cache`` is given.
+    ``told``: print what the recordings themselves show.
     """
     from adaptfault.inspection.fit_cache import FitCache
     from diagnostics import SelfDiagnosis
+    from diagnostics.when.reference_findings import ReferenceWarning
 
     kept = None
     if getattr(args, "reference", None) and not args.no_cache:
@@ -504,11 +510,21 @@ def fit_diagnoser(args: argparse.Namespace, recordings: Recordings) -> SelfDiagn
             say(args, f"taking the healthy model from {kept.path}")
             return fitted
     say(args, f"fitting the healthy model of the diagnosis on {len(recordings)} recordings")
-    with fitting_bar(args) as advance:
-        fitted = SelfDiagnosis(recordings.layout).fit(recordings.frames, progress=advance)
+    fitted = SelfDiagnosis(recordings.layout)
+    with fitting_bar(args) as advance, warnings.catch_warnings():
+        warnings.simplefilter("ignore", ReferenceWarning)  # told below, with names
+        fitted.fit(recordings.frames, progress=advance)
+    if told:
+        warn_of_reference(fitted.reference_findings_, recordings.names)
     if kept is not None:
         kept.save(fitted)
     return fitted
+
+
+def warn_of_reference(findings: Sequence[ReferenceFinding], names: Sequence[str]) -> None:
+    """Print what a reference itself shows, with the names of its recordings."""
+    for finding in findings:
+        print(f"warning: {finding.named(names)}", file=sys.stderr)
 
 
 def add_cache(parser: argparse.ArgumentParser) -> None:

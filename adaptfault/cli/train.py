@@ -22,6 +22,7 @@ from adaptfault.cli.options import (
     load_recordings,
     progress,
     say,
+    warn_of_reference,
 )
 from adaptfault.cli.paths import WrittenFolder, is_bundle
 
@@ -94,7 +95,9 @@ def add(commands: Commands) -> None:
         ),
     )
     parser.add_argument(
-        "--strict", action="store_true", help="exit code 1 if the training shows a sign of failure"
+        "--strict",
+        action="store_true",
+        help="exit code 1 if recordings show faults, or the training a sign of failure",
     )
     parser.add_argument(
         "--model",
@@ -119,6 +122,8 @@ def run(args: argparse.Namespace) -> int:
     _check_options(args, out, bundled)
     recordings = load_recordings(args, args.recordings, labelled=True)
     where = device(args)
+    if _shows_faults(recordings) and args.strict:
+        return 1
 
     from adaptfault.adaptation.adapter import Adapter
     from adaptfault.cli.trained_model import say_short
@@ -184,6 +189,15 @@ def run(args: argparse.Namespace) -> int:
             say(args, note)
     problems = _told(args, out, bundled, scores, history, names, extra, (parts[2].y, predicted))
     return int(args.strict and bool(problems))
+
+
+def _shows_faults(recordings: Recordings) -> bool:
+    """Warn of cells that are dead in some of the recordings; return whether there are any."""
+    from diagnostics import SelfDiagnosis
+
+    findings = SelfDiagnosis(recordings.layout).judge(recordings.frames, classes=recordings.labels)
+    warn_of_reference(findings, recordings.names)
+    return bool(findings)
 
 
 def _check_classes(path: str, recordings: Recordings) -> None:
@@ -411,7 +425,7 @@ def _bundle(
         out,
         adapter.model,
         adapter,
-        fit_diagnoser(args, recordings.select(np.unique(training.recording))),
+        fit_diagnoser(args, recordings.select(np.unique(training.recording)), told=False),
         check=test,
         class_names=names,
         calibration=Calibration.read(args.calibration) if args.calibration else None,

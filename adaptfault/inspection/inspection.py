@@ -170,7 +170,7 @@ def inspect(
     common = None
     if diagnoser.reference_ is None:
         fitted = diagnoser.for_log(log, classes=classes, progress=progress)
-        readings = ChangedReadings(None, None, log, fitted.diagnose(log))
+        readings = ChangedReadings(None, None, log, fitted.diagnose(log, classes=classes))
     else:
         told = any(one.name in _OF_ALL_CELLS for one in disturbances)
         readings, common = _judged(log, healthy, diagnoser, disturbed=told)

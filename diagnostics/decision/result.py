@@ -57,6 +57,25 @@ class Verdict(IntEnum):
         return self.name
 
 
+_OF_VERDICT = "AFU"  # letters of the verdicts in a stored diagnosis
+
+
+@dataclass(frozen=True, eq=False)
+class RecordingVerdicts:
+    """The verdicts of a log by recording.
+
+    Attributes:
+        verdicts: array ``[n_recordings, D]`` of :class:`Verdict`. A cell that does not move in a
+            recording is UNTESTED there, unless it is faulty.
+        probability: float ``[n_recordings, D]``, P(cell is faulty in the recording).
+        names: of the recordings.
+    """
+
+    verdicts: NDArray[np.object_]
+    probability: NDArray[np.float64]
+    names: tuple[str, ...]
+
+
 @shown
 @dataclass(frozen=True, eq=False)
 class Diagnosis:
@@ -77,6 +96,9 @@ class Diagnosis:
         evidence: float ``[D]`` each: ``"spatial"`` and ``"temporal"``, log likelihood ratios faulty
             : healthy (0: no evidence), and ``"events"``, number of events that tested the cell.
             Evidence of wires is in ``faults``.
+        states: uint8 ``[n_recordings, D]``, the verdict of each cell in each recording; None: all
+            recordings have that of the log. :attr:`by_recording` tells them.
+        names: of the recordings; empty: they are numbered from 0.
     """
 
     layout: SensorLayout
@@ -90,6 +112,8 @@ class Diagnosis:
     possible: tuple[Fault, ...] = ()
     static_loads: tuple[StaticLoad, ...] = ()
     contradicting: float = 0.0
+    states: NDArray[np.uint8] | None = None
+    names: tuple[str, ...] = ()
 
     @cached_property
     def fault_set(self) -> FaultSet:
@@ -182,6 +206,19 @@ class Diagnosis:
         code[self.fault_set.mask] = Verdict.FAULTY
         # Enum members: NumPy would convert them to integers.
         return np.array(list(Verdict), dtype=object)[code]
+
+    @cached_property
+    def by_recording(self) -> RecordingVerdicts:
+        """The verdicts by recording: in which a fault shows, and which of them tested a cell."""
+        n = max(self.n_recordings, 1)
+        code = np.tile(self.verdicts.astype(np.uint8), (n, 1))
+        if self.states is not None:
+            code = self.states
+        # works in a recording, but not in another one
+        recovers = self.fault_set.mask & (code != Verdict.FAULTY)
+        probability = np.where(recovers, 0.0, self.probability)
+        names = self.names or tuple(map(str, range(len(code))))
+        return RecordingVerdicts(np.array(list(Verdict), dtype=object)[code], probability, names)
 
     @cached_property
     def coverage(self) -> Coverage:
@@ -300,12 +337,20 @@ class Diagnosis:
             "transport": [fault.to_dict() for fault in self.transport],
             "n_frames": self.n_frames,
             "n_recordings": self.n_recordings,
+            "by_recording": self._recordings_as_text(),
             "coverage": {
                 **asdict(self.coverage),
                 "untested": self.coverage.untested.tolist(),
                 "advice": list(self.coverage.advice),
             },
         }
+
+    def _recordings_as_text(self) -> dict[str, Any] | None:
+        """Return the verdicts by recording, a letter a cell; None where they are not known."""
+        if self.states is None:
+            return None
+        letters = ["".join(_OF_VERDICT[code] for code in row) for row in self.states.tolist()]
+        return {"names": list(self.by_recording.names), "verdicts": letters}
 
     @classmethod
     def from_dict(cls, d: Mapping[str, Any]) -> Diagnosis:
@@ -336,6 +381,7 @@ class Diagnosis:
                     StaticLoad.from_dict(load) for load in d.get("static_loads", ())
                 ),
                 contradicting=float(d.get("contradicting", 0.0)),
+                **_recordings_of(d.get("by_recording"), len(d["verdicts"])),
             )
         except (KeyError, TypeError, AttributeError, OverflowError) as error:
             raise ValueError(f"the diagnosis is damaged: {type(error).__name__} {error}") from None
@@ -373,3 +419,18 @@ class Diagnosis:
             diagnosis.fault_set,
         )
         return diagnosis
+
+
+def _recordings_of(about: Mapping[str, Any] | None, n_cells: int) -> dict[str, Any]:
+    """Return verdicts by recording and names of a stored diagnosis; empty where it has none.
+
+    Raises:
+        ValueError: letters of other verdicts, or of another number of cells.
+    """
+    if about is None:
+        return {}
+    code = [[_OF_VERDICT.find(letter) for letter in row] for row in about["verdicts"]]
+    if any(len(row) != n_cells or -1 in row for row in code):
+        raise ValueError("the diagnosis is damaged: verdicts by recording do not fit the cells")
+    states = np.array(code, dtype=np.uint8).reshape(-1, n_cells)
+    return {"states": states, "names": tuple(map(str, about["names"]))}

@@ -75,7 +75,8 @@ def watched(
 
 
 def without_recordings(diagnosis) -> dict:
-    return {key: value for key, value in diagnosis.to_dict().items() if key != "n_recordings"}
+    unknown = ("n_recordings", "by_recording")
+    return {key: value for key, value in diagnosis.to_dict().items() if key not in unknown}
 
 
 EVERY = mixes([0, 1, 2, 3, 4])

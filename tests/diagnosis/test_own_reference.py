@@ -8,7 +8,7 @@ import pytest
 from adaptfault.data.simulated_grasps import simulate
 from diagnostics import Fault, FaultKind, SelfDiagnosis, SensorLayout, Verdict, inject
 from diagnostics.decision.calibration import Calibrator
-from diagnostics.diagnosis import OWN_REFERENCE
+from diagnostics.when import OWN_REFERENCE
 
 LAYOUT = SensorLayout(1, 8, 8)
 FAILS = 25  # recording from which on cells are dead

@@ -1,7 +1,8 @@
 """Writes which readings are valid, a bool a cell and frame, beside a data set: never into it.
 
-A reading is valid where its cell exists, is not in F (from the onset of its fault on), and is not
-missing. No published contract of data sets has such a field; the names here are
+A reading is valid where its cell exists, is not in F (in the recordings in which its fault shows,
+or from the onset of the fault on), and is not missing. No published contract of data sets has such
+a field; the names here are
 
 - NPZ: ``valid`` bool ``[n, T, pads, rows, cols]``, ``lengths``, ``names``
 - Parquet: ``episode_index``, ``frame_index`` and ``index`` as in the data set, and
@@ -45,13 +46,18 @@ def valid_masks(
     """Yield bool ``[T, D]`` of each recording of a log, in time order."""
     onset = np.full(layout.n_cells, np.iinfo(np.int64).max)
     for fault in faults:
-        cells = list(fault.cells)
-        onset[cells] = np.minimum(onset[cells], fault.onset or 0)
+        if fault.recordings is None:
+            cells = list(fault.cells)
+            onset[cells] = np.minimum(onset[cells], fault.onset or 0)
     present = layout.present.ravel()
     before = 0
-    for frames in recordings:
+    for number, frames in enumerate(recordings):
         at = before + np.arange(len(frames))[:, None]
-        yield present & (at < onset) & np.isfinite(frames)
+        works = present.copy()
+        for fault in faults:
+            if fault.recordings is not None and number in fault.recordings:
+                works[list(fault.cells)] = False
+        yield works & (at < onset) & np.isfinite(frames)
         before += len(frames)
 
 

@@ -1,0 +1,199 @@
+"""When a cell failed: verdicts by recording, and faults that show in some recordings only.
+
+The whole log tells what is faulty at its end. Recordings in which cells hold a value although those
+beside them move (:mod:`diagnostics.when`) are diagnosed as a log of their own; what that finds
+besides shows in these recordings. Cells whose held values are certain are faulty in any case.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from diagnostics.decision.result import Diagnosis, Verdict
+from diagnostics.faults import Fault, FaultKind
+from diagnostics.preprocessing.levels import LEAST_LOADED, MAJORITY
+from diagnostics.when.recording_numbers import ranges
+from diagnostics.wiring import Line
+
+if TYPE_CHECKING:
+    from diagnostics.layout import SensorLayout
+    from diagnostics.when import Held
+
+_PARTS = 4  # sets of recordings that are diagnosed, at most: a size
+_HOLDS = (FaultKind.OPEN, FaultKind.SHORT, FaultKind.STUCK, FaultKind.INTERMITTENT)
+
+Cells = NDArray[np.intp]
+Recordings = tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class _State:
+    """Recordings in which some cells are suspect."""
+
+    recordings: Recordings
+    cells: Cells
+
+
+def with_recordings(
+    whole: Diagnosis,
+    held: Held,
+    lengths: Sequence[int],
+    tolerance: float,
+    diagnose: Callable[[Recordings], Diagnosis] | None,
+) -> Diagnosis:
+    """Return the diagnosis of a log with what shows in some of its recordings only.
+
+    Args:
+        whole: the diagnosis of the log.
+        held: where cells hold a value although those beside them move, in the order of the layout.
+        lengths: frames of each recording.
+        tolerance: readings within +- this of a value count as that value.
+        diagnose: diagnoses some recordings as a log of their own; None: they are not at hand.
+    """
+    # What an object holds, or its edge, is no held value of a cell.
+    held = replace(held, suspect=held.suspect & ~whole.disturbed.mask)
+    first = np.concatenate([[0], np.cumsum(lengths)]).tolist()
+    last = len(lengths) - 1
+    # What comes and goes by recording is told better by the recordings in which it shows.
+    partly = [fault for fault in whole.faults if _comes_and_goes(fault, held)]
+    faults = [_located(fault, held, first) for fault in whole.faults if fault not in partly]
+    found = {cell for fault in faults for cell in fault.cells}
+    probability = whole.probability.copy()
+    tested = whole.tested & ~held.suspect.any(axis=0)
+    for state in _states(held)[:_PARTS]:
+        if diagnose is None or set(state.cells.tolist()) <= found:
+            continue
+        part = diagnose(state.recordings)
+        for fault in part.faults:
+            new = set(fault.cells) - found
+            if not new or (fault.line is None and len(new) < len(fault.cells)):
+                continue
+            shown = replace(fault, recordings=state.recordings, onset=first[state.recordings[0]])
+            faults.append(_told(shown, last))
+            found |= new
+            cells = list(fault.cells)
+            probability[cells] = np.maximum(probability[cells], part.probability[cells])
+    for fault in partly:
+        if not set(fault.cells) <= found:
+            faults.append(_located(fault, held, first))
+            found |= set(fault.cells)
+    certain = np.asarray(held.certain.any(axis=0))
+    certain[list(found)] = False
+    for fault in _held_faults(certain, held, whole.layout, tolerance):
+        assert fault.recordings is not None
+        faults.append(_told(replace(fault, onset=first[fault.recordings[0]]), last))
+        cells = list(fault.cells)
+        probability[cells] = np.maximum(probability[cells], fault.probability or 0.0)
+    tested[[cell for fault in faults for cell in fault.cells]] = True
+    result = replace(whole, faults=tuple(faults), probability=probability, tested=tested)
+    return replace(result, states=_verdicts(result, held, first))
+
+
+def _states(held: Held) -> list[_State]:
+    """Return the sets of recordings in which cells are suspect; sets that hardly differ are one."""
+    states: list[_State] = []
+    for recordings, cells in held.states():
+        for k, other in enumerate(states):
+            either = set(recordings) | set(other.recordings)
+            differ = set(recordings) ^ set(other.recordings)
+            if len(differ) <= LEAST_LOADED * len(either):
+                states[k] = _State(tuple(sorted(either)), np.append(other.cells, cells))
+                break
+        else:
+            states.append(_State(recordings, cells))
+    return states
+
+
+def _comes_and_goes(fault: Fault, held: Held) -> bool:
+    """Return whether most cells of an intermittent fault are suspect in some recordings."""
+    suspect = held.suspect[:, list(fault.cells)].any(axis=0)
+    return fault.kind is FaultKind.INTERMITTENT and bool(suspect.mean() > MAJORITY)
+
+
+def _located(fault: Fault, held: Held, first: Sequence[int]) -> Fault:
+    """Return a fault of the whole log with its recordings, where its cells are suspect in some that
+    are not the last ones."""
+    of_cells = held.suspect[:, list(fault.cells)]
+    each = of_cells.sum(axis=1) >= max(1, of_cells.any(axis=0).sum() / 2)
+    recordings = np.flatnonzero(each)
+    last = len(each) - 1
+    lasts = len(recordings) == 0 or len(recordings) == last - recordings[0] + 1
+    if lasts or fault.kind not in _HOLDS:
+        return fault
+    shown = replace(fault, recordings=tuple(recordings.tolist()), onset=first[recordings[0]])
+    return _told(shown, last)
+
+
+def _told(fault: Fault, last: int) -> Fault:
+    """Return a fault whose sentence names its recordings; ``last``: number of the last of all."""
+    recordings = fault.recordings
+    if recordings is None or len(recordings) > last:
+        return replace(fault, recordings=None, onset=None)
+    gone = "" if recordings[-1] == last else "; it works again after them"
+    where = "recording" if len(recordings) == 1 else "recordings"
+    text = f"{fault.reason} (in {where} {ranges(recordings)}{gone})"
+    return replace(fault, reason=text)
+
+
+def _held_faults(
+    certain: NDArray[np.bool_], held: Held, layout: SensorLayout, tolerance: float
+) -> list[Fault]:
+    """Return a fault for each certain cell (bool ``[D]``), and one for each line of them."""
+    left = certain.copy()
+    faults = []
+    for line in layout.lines:
+        cells = layout.cells_on(line)
+        cells = cells[layout.present.ravel()[cells]]
+        one_set = len(cells) > 1 and left[cells].all()
+        if one_set and (held.suspect[:, cells] == held.suspect[:, cells[:1]]).all():
+            faults.append(_held_fault(cells, line, held, layout, tolerance))
+            left[cells] = False
+    for cell in np.flatnonzero(left).tolist():
+        faults.append(_held_fault(np.array([cell]), None, held, layout, tolerance))
+    return faults
+
+
+def _held_fault(
+    cells: Cells, line: Line | None, held: Held, layout: SensorLayout, tolerance: float
+) -> Fault:
+    """Return the fault of cells that hold a value in some recordings."""
+    value = float(np.median(held.value[cells]))
+    kind = FaultKind.STUCK
+    if value <= 2 * tolerance:
+        kind = FaultKind.OPEN
+    elif value >= layout.full_scale - 2 * tolerance:
+        kind = FaultKind.SHORT
+    where = layout.place(int(cells[0])) if line is None else str(line)
+    recordings = tuple(np.flatnonzero(held.suspect[:, cells[0]]).tolist())
+    return Fault(
+        kind,
+        tuple(cells.tolist()),
+        line=line,
+        value=value,
+        probability=float(held.probability[cells].min()),
+        reason=f"{where} {kind.verb()} at {value:.4g} {layout.unit}, while the cells beside move",
+        evidence=len(recordings),
+        recordings=recordings,
+    )
+
+
+def _verdicts(diagnosis: Diagnosis, held: Held, first: Sequence[int]) -> NDArray[np.uint8]:
+    """Return the verdict of each cell in each recording, ``[n, D]``.
+
+    A cell is ALIVE where it moved, is not suspect, and the whole log has tested it.
+    """
+    alive = held.moved & ~held.suspect & (diagnosis.verdicts != Verdict.UNTESTED)
+    code = np.where(alive, Verdict.ALIVE, Verdict.UNTESTED).astype(np.uint8)
+    number = np.arange(len(code))
+    ends = np.array(first[1:])
+    for fault in diagnosis.faults:
+        shows = ends > (fault.onset or 0)
+        if fault.recordings is not None:
+            shows = np.isin(number, fault.recordings)
+        code[np.ix_(shows, np.array(fault.cells))] = Verdict.FAULTY
+    return code

@@ -1,0 +1,38 @@
+"""The part of a log that is its own reference: recordings in which no cell is suspect.
+
+Of each class the first half is taken: a cell that fails later is compared with how it worked
+before, and recordings that lie class by class say nothing of other classes. Recordings with suspect
+cells take part, with these readings filled, only where the others are too few.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from diagnostics.preprocessing.readings import RecordingBlocks
+from diagnostics.when.held import Held
+
+# recordings from which on a log is its own reference: with a model of ten, healthy cells are blamed
+OWN_REFERENCE = 32
+
+
+def own_reference(log: RecordingBlocks, held: Held, classes: ArrayLike | None) -> list[int]:
+    """Return the numbers of the recordings of a log that serve as its reference, ascending."""
+    n = len(log)
+    label = np.zeros(n, np.intp)
+    if classes is not None:
+        _, label = np.unique(np.asarray(classes), return_inverse=True)
+    clean = np.asarray(~held.suspect.any(axis=1))
+    if clean.sum() < OWN_REFERENCE // 2:
+        clean[:] = True
+    half = n // 2 if classes is None else 0
+    chosen = []
+    for one in np.unique(label):
+        of_class = label == one
+        most = half or (int(of_class.sum()) + 1) // 2
+        chosen += np.flatnonzero(of_class & clean)[:most].tolist()
+    # Classes without a clean recording leave room for more of the others.
+    others = [i for i in np.flatnonzero(clean).tolist() if i not in chosen]
+    chosen += others[: max(0, n // 2 - len(chosen))]
+    return sorted(chosen)

@@ -1,0 +1,56 @@
+"""The range of each cell in each recording: all that the search for held values needs of a log."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from diagnostics.preprocessing.readings import RecordingBlocks
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Spans:
+    """The lowest and the highest reading of each cell in each recording, ``[n, D]`` each.
+
+    NaN: the cell has no reading in the recording.
+    """
+
+    low: Floats
+    high: Floats
+
+    @classmethod
+    def of(cls, recordings: RecordingBlocks) -> Spans:
+        """Return the spans of recordings ``[T, D]``."""
+        each = [RecordingBlocks([given]).extremes() for given in recordings.given]
+        return cls(np.stack([low for low, _ in each]), np.stack([high for _, high in each]))
+
+    @classmethod
+    def joined(cls, parts: Sequence[Spans]) -> Spans:
+        """Return the spans of all parts as one."""
+        return cls(
+            np.concatenate([part.low for part in parts]),
+            np.concatenate([part.high for part in parts]),
+        )
+
+    def __len__(self) -> int:
+        return len(self.low)
+
+    @property
+    def known(self) -> NDArray[np.bool_]:
+        """Whether a cell has a reading in a recording, bool ``[n, D]``."""
+        return np.isfinite(self.low)
+
+    @property
+    def ranges(self) -> Floats:
+        """Highest minus lowest reading, ``[n, D]``; 0 without any."""
+        return np.nan_to_num(self.high - self.low)
+
+    @property
+    def middles(self) -> Floats:
+        """Middle of the readings, ``[n, D]``; NaN without any."""
+        return (self.high + self.low) / 2

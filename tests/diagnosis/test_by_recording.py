@@ -1,0 +1,104 @@
+"""In which recordings a fault shows, with and without a reference."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from adaptfault.data.recordings.valid import valid_masks
+from adaptfault.data.simulated_grasps import simulate
+from diagnostics import Diagnosis, Fault, FaultKind, SelfDiagnosis, SensorLayout, Verdict
+from diagnostics.when.reference_findings import ReferenceWarning
+
+LAYOUT = SensorLayout(1, 8, 8)
+ROW = [LAYOUT.cell(0, 3, column) for column in range(8)]
+STUCK = LAYOUT.cell(0, 5, 4)
+DEAD = sorted([*ROW, STUCK])
+MIDDLE = tuple(range(14, 28))
+pytestmark = pytest.mark.usefixtures("uncalibrated")
+
+
+@pytest.fixture(scope="module")
+def grasps() -> list[np.ndarray]:
+    frames = simulate(6, LAYOUT, n_frames=50, seed=3).frames
+    order = np.random.default_rng(0).permutation(len(frames))
+    return [np.asarray(frames[i], dtype=np.float64) for i in order]
+
+
+@pytest.fixture(scope="module")
+def seated_again(grasps: list[np.ndarray]) -> list[np.ndarray]:
+    """A row and a cell are dead in the middle third of the recordings."""
+    log = [recording.copy() for recording in grasps]
+    for i in MIDDLE:
+        log[i][:, ROW] = 0.0
+        log[i][:, STUCK] = 1.7
+    return log
+
+
+@pytest.fixture(scope="module")
+def diagnosis(seated_again: list[np.ndarray]) -> Diagnosis:
+    from conftest import without_calibration
+
+    with without_calibration():
+        return SelfDiagnosis(LAYOUT).diagnose(seated_again)
+
+
+def test_what_is_dead_for_some_recordings_and_works_again_is_found_with_them(diagnosis):
+    assert diagnosis.fault_set == set(DEAD)
+    assert diagnosis.exit_code == 2
+    assert {fault.recordings for fault in diagnosis.faults} == {MIDDLE}
+    assert all("in recordings 14 to 27; it works again" in f.reason for f in diagnosis.faults)
+
+
+def test_each_recording_has_verdicts_of_its_own(diagnosis, grasps):
+    told = diagnosis.by_recording
+    assert told.verdicts.shape == told.probability.shape == (len(grasps), 64)
+    faulty = told.verdicts == Verdict.FAULTY
+    assert faulty[np.ix_(MIDDLE, DEAD)].all()
+    assert faulty.sum() == len(MIDDLE) * len(DEAD)
+    still = np.array([np.ptp(recording, axis=0) == 0 for recording in grasps])
+    assert not ((told.verdicts == Verdict.ALIVE) & still).any()
+    assert told.probability[0, DEAD].max() == 0
+    assert told.probability[MIDDLE[0], DEAD].min() > 0.9
+
+
+def test_a_stored_diagnosis_keeps_the_recordings(diagnosis):
+    again = Diagnosis.from_dict(json.loads(json.dumps(diagnosis.to_dict())))
+    assert again.faults == diagnosis.faults
+    np.testing.assert_array_equal(again.by_recording.verdicts, diagnosis.by_recording.verdicts)
+
+
+def test_the_mask_marks_these_recordings_alone(diagnosis, seated_again):
+    masks = list(valid_masks(seated_again, diagnosis.faults, LAYOUT))
+    for number, mask in enumerate(masks):
+        assert mask[:, DEAD].all() == (number not in MIDDLE)
+        assert np.delete(mask, DEAD, axis=1).all()
+
+
+def test_a_reference_that_is_broken_in_part_is_told_and_nothing_is_learned_from_it(seated_again):
+    fitted = SelfDiagnosis(LAYOUT)
+    with pytest.warns(ReferenceWarning, match="in recordings 14 to 27, pad 0, row 3"):
+        fitted.fit(seated_again)
+    assert fitted.reference_findings_[0].recordings == MIDDLE
+    assert set(fitted.reference_findings_[0].cells) == set(DEAD)
+    assert fitted.diagnose(seated_again).fault_set == set(DEAD)
+    assert fitted.diagnose([seated_again[i] for i in MIDDLE]).fault_set == set(DEAD)
+
+
+def test_a_strict_fit_refuses_it(seated_again):
+    with pytest.raises(ValueError, match="the reference is no healthy one"):
+        SelfDiagnosis(LAYOUT).fit(seated_again, strict=True)
+
+
+def test_a_healthy_reference_shows_nothing(grasps):
+    assert SelfDiagnosis(LAYOUT).judge(grasps) == ()
+
+
+def test_a_fault_keeps_its_recordings_in_a_document():
+    fault = Fault(FaultKind.OPEN, (3,), recordings=(1, 4))
+    assert Fault.from_dict(json.loads(json.dumps(fault.to_dict()))) == fault
+    assert "recordings" not in Fault(FaultKind.OPEN, (3,)).to_dict()
+    with pytest.raises(ValueError, match="expected a fault"):
+        Fault.from_dict({"kind": "open", "cells": [3], "recordings": ["first"]})

@@ -1,0 +1,89 @@
+"""Recordings in which cells hold a value while those beside them move."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from adaptfault.data.simulated_grasps import simulate
+from diagnostics import SensorLayout
+from diagnostics.preprocessing.readings import RecordingBlocks
+from diagnostics.when import Spans, filled, find_held
+from diagnostics.when.recording_numbers import ranges
+
+LAYOUT = SensorLayout(1, 8, 8)
+TOLERANCE = 0.025
+ROW = [LAYOUT.cell(0, 3, column) for column in range(8)]
+N = 42
+
+
+@pytest.fixture(scope="module")
+def grasps() -> list[np.ndarray]:
+    """Grasps with noise, which every healthy cell has."""
+    rng = np.random.default_rng(0)
+    frames = simulate(6, LAYOUT, n_frames=50, seed=3).frames
+    order = rng.permutation(len(frames))[:N]
+    return [frames[i] + rng.normal(0, 0.01, frames[i].shape) + 0.1 for i in order]
+
+
+def broken(grasps: list[np.ndarray], cells: list[int], where: set[int]) -> list[np.ndarray]:
+    """Return the recordings with cells that hold a value in some of them."""
+    log = [recording.copy() for recording in grasps]
+    for i in where:
+        log[i][:, cells] = 0.0
+    return log
+
+
+def found(log: list[np.ndarray], classes: np.ndarray | None = None) -> np.ndarray:
+    return find_held(Spans.of(RecordingBlocks(log)), LAYOUT, TOLERANCE, classes).suspect
+
+
+@settings(max_examples=12)
+@given(
+    cells=st.sampled_from([ROW, ROW[2:4], [LAYOUT.cell(0, 4, 4)]]),
+    where=st.one_of(
+        st.integers(3, N - 3).map(lambda n: set(range(n))),
+        st.integers(3, N - 3).map(lambda n: set(range(n, N))),
+        st.just(set(range(N // 3, 2 * N // 3))),
+        st.sets(st.integers(0, N - 1), min_size=3, max_size=N - 8),
+    ),
+)
+def test_any_set_of_recordings_in_which_cells_are_dead_is_found(grasps, cells, where):
+    suspect = found(broken(grasps, cells, where))
+    truth = np.zeros_like(suspect)
+    truth[np.ix_(sorted(where), cells)] = True
+    assert not np.delete(suspect, cells, axis=1).any()
+    # A recording between two of them that does not touch a cell counts as one of them.
+    between = ~truth & np.roll(truth, 1, axis=0) & np.roll(truth, -1, axis=0)
+    assert not (suspect & ~truth & ~between).any()
+    assert (suspect & truth).sum() >= 0.7 * truth.sum()
+
+
+def test_nothing_is_suspect_in_healthy_recordings(grasps):
+    assert not found(grasps).any()
+    quiet = [np.where(recording > 0.2, recording, 0.0) for recording in grasps]
+    assert not found(quiet).any()
+
+
+def test_few_recordings_say_nothing(grasps):
+    assert not found(broken(grasps[:10], ROW, set(range(5)))).any()
+
+
+def test_filled_recordings_hold_healthy_readings_only(grasps):
+    where = set(range(20, N))
+    log = broken(grasps, ROW, where)
+    held = find_held(Spans.of(RecordingBlocks(log)), LAYOUT, TOLERANCE)
+    whole = filled(RecordingBlocks(log), held, LAYOUT)
+    others = np.setdiff1d(np.arange(64), ROW)
+    for before, after in zip(log, whole, strict=True):
+        np.testing.assert_array_equal(before[:, others], after[:, others])
+    truth = np.concatenate([grasps[i][:, ROW] for i in where])
+    known = np.concatenate([whole[i][:, ROW] for i in where])
+    assert np.corrcoef(truth.ravel(), known.ravel())[0, 1] > 0.8
+
+
+def test_numbers_are_told_as_ranges():
+    assert ranges([3, 5, 6, 7, 9]) == "3, 5 to 7, 9"
+    assert ranges(range(0, 40, 2)).endswith("and 14 more ranges")

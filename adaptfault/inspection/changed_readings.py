@@ -14,12 +14,15 @@ from diagnostics.preprocessing.levels import LEAST_LOADED
 from diagnostics.sensor.recalibration import Recalibration, find_recalibration, recalibrated
 from diagnostics.sensor.rewiring import Rewiring
 from diagnostics.sensor.sensor_change import SensorChange, find_change
-from diagnostics.sensor.swapped_in_part import SwappedInPart
+from diagnostics.sensor.swapped_in_part import SwappedInPart, newest_contradict
 
 if TYPE_CHECKING:
     from adaptfault.bundle.versions import Version
 
 Frames = list[NDArray[np.float64]]
+
+FEWEST = 12
+"""Recordings of a log, in whose halves a change is found again."""
 
 
 @dataclass(frozen=True)
@@ -56,6 +59,34 @@ class ChangedReadings:
             "rewiring": () if self.rewiring is None else self.rewiring.steps,
             "replaced_pads": () if self.recalibration is None else self.recalibration.pads,
         }
+
+    def doubt(self, diagnoser: SelfDiagnosis) -> str | None:
+        """Return why the change is no reason for a new version, in one sentence; None where it is.
+
+        It must be found again, alike, in the older half of the log, in the newer half, and in the
+        newest recordings: one part of a log does not decide about all that follows.
+
+        Args:
+            diagnoser: fitted; with it the change was found.
+        """
+        if self.recalibration is not None and not self.recalibration.throughout:
+            return "not each half of the recordings shows it by itself; record more"
+        if self.rewiring is None:
+            return None
+        n = len(self.frames)
+        if n < FEWEST:
+            return f"{n} recordings do not prove it, record at least {FEWEST}"
+        came = np.argsort(self.rewiring.source)
+        frames = [recording[:, came] for recording in self.frames]
+        halves = {"older": frames[: n // 2], "newer": frames[n // 2 :]}
+        for name, half in halves.items():
+            if not _found_again(diagnoser, half, self.rewiring):
+                return f"the {name} half of the recordings does not show it by itself, record more"
+        assert diagnoser.reference_ is not None  # a rewiring was found with it
+        loads = as_loads(diagnoser, frames)
+        if newest_contradict(self.rewiring, loads, diagnoser.reference_, diagnoser.layout):
+            return "the newest recordings contradict it"
+        return None
 
     def readings(self, version: Version) -> dict[str, list[Any]]:
         """Return how a version undoes the change, on top of what ``version`` undoes; see
@@ -119,6 +150,12 @@ def find_changed_readings(
         return as_found
     undone = [recalibration.undo(recording, diagnoser.layout.full_scale) for recording in frames]
     return ChangedReadings(None, recalibration, undone, diagnoser.diagnose(undone), as_found)
+
+
+def _found_again(diagnoser: SelfDiagnosis, frames: Frames, rewiring: Rewiring) -> bool:
+    """Return whether recordings show the same exchange of wires by themselves."""
+    again = diagnoser.rewiring(frames)
+    return again is not None and np.array_equal(again.source, rewiring.source)
 
 
 def _put_back(diagnoser: SelfDiagnosis, frames: Frames) -> ChangedReadings | None:

@@ -221,7 +221,7 @@ def _decide(run: MaintenanceRun, inspection: Inspection) -> _Outcome:
 
 def _decide_readings(run: MaintenanceRun, changed: ChangedReadings) -> _Outcome:
     """Decide about exchanged wires or replaced pads; nothing is deployed where the running version
-    is as good."""
+    is as good, or where a half of the log does not show them."""
     renewed = run
     if changed.recalibration is not None:
         renewed = replace(run, known=run.known.without(changed.recalibration.on(run.robot.layout)))
@@ -231,12 +231,14 @@ def _decide_readings(run: MaintenanceRun, changed: ChangedReadings) -> _Outcome:
         reason = Reason(2, f"{changed.reason}; not undone: {refusal}")
         return _Outcome("refused", (reason,), run.known, changed, changed, used=False)
     judgement = _judged_readings(run, changed, known)
+    why: str | None = f"version {run.version.number} is as good without it, {judgement}"
     if _was_rolled_back(run, changed):
-        why = "not undone: a version that undid it was rolled back before"
+        why = "a version that undid it was rolled back before"
     elif judgement.better and not judgement.collapsed:
+        why = changed.doubt(run.robot.diagnoser)
+    if why is None:
         return _undone(renewed, changed, judgement)
-    else:
-        why = f"not undone: version {run.version.number} is as good without it, {judgement}"
+    why = f"not undone: {why}"
     if changed.as_found is None:
         return _Outcome(
             "kept",

@@ -15,7 +15,8 @@ gives them the same gains or offsets, with a standard deviation over the cells (
 comedian of the halves, which a few faulty cells do not raise; Falk 1997) of half of log 1.3 or 1 %
 of full scale. Another task changes the loads of all cells alike; a strap gives neighbours alike
 offsets, those of a new pad are independent. The correction must also raise the pseudo-likelihood of
-recordings that it was not learned from, by more than four standard errors over these recordings.
+recordings that it was not learned from, by more than four standard errors over these recordings; by
+two in the older and in the newer half, where it is to be undone.
 
 Not detected: other noise, other thresholds, and gains of cells that no event loads: these take the
 mean of their pad.
@@ -64,12 +65,14 @@ class Recalibration:
         gain, offset: float ``[D]``; 1 and 0 on pads that were not replaced.
         pads: the replaced pads.
         recordings: number of recordings that it was learned from.
+        throughout: whether the older and the newer half of them show it, each by itself.
     """
 
     gain: Floats
     offset: Floats
     pads: tuple[int, ...]
     recordings: int
+    throughout: bool = True
 
     @property
     def reason(self) -> str:
@@ -142,6 +145,8 @@ def find_recalibration(
             ]
         )
     gained = np.concatenate(gains, axis=2)
+    # in order of time: the first half was learned from the even recordings, and scored the others
+    gained = gained[..., np.argsort(np.r_[1 : len(new) : 2, : len(new) : 2])]
     best = gained.mean(axis=2).argmax(axis=0)
     certain = [i for i in range(len(differing)) if _certain(gained[best[i], i])]
     if not certain:
@@ -150,6 +155,7 @@ def find_recalibration(
     gain = np.ones_like(log_gain)
     rest = reference.scale.baseline
     replaced = []
+    throughout = True
     moved = np.zeros_like(offset)
     for i in certain:
         on = differing[i]
@@ -161,9 +167,12 @@ def find_recalibration(
         )
         if not hidden:
             replaced.append(int(layout.pad_of[on][0]))
+            throughout &= _throughout(gained[best[i], i])
             gain[on] = np.exp(log_gain[on]) if best[i] == 0 else 1.0
             moved[on] = (rest + offset - gain * rest)[on]
-    return Recalibration(gain, moved, tuple(replaced), len(new)) if replaced else None
+    if not replaced:
+        return None
+    return Recalibration(gain, moved, tuple(replaced), len(new), throughout)
 
 
 def _correlation(offset: Floats, on: Mask, layout: SensorLayout) -> tuple[float, float]:
@@ -192,11 +201,17 @@ def _common_spread(one: Floats, other: Floats, on: Mask) -> float:
     return float(np.sqrt(max(np.median(products), 0.0))) / _MEDIAN_DEVIATION
 
 
-def _certain(gained: Floats) -> bool:
-    """Return whether the mean of values ``[n]`` is positive beyond chance."""
-    return bool(
-        gained.mean() > _ERRORS * gained.std(ddof=1) / np.sqrt(len(gained)) and gained.mean() > 0
-    )
+def _certain(gained: Floats, errors: float = _ERRORS) -> bool:
+    """Return whether the mean of values ``[n]`` is positive by more than so many standard
+    errors."""
+    error = gained.std(ddof=1) / np.sqrt(len(gained))
+    return bool(gained.mean() > errors * error and gained.mean() > 0)
+
+
+def _throughout(gained: Floats) -> bool:
+    """Return whether values ``[n]``, in order of time, are positive in each half of them."""
+    older, newer = np.array_split(gained, 2)
+    return _certain(older, _ERRORS / 2) and _certain(newer, _ERRORS / 2)
 
 
 @dataclass(frozen=True)

@@ -23,8 +23,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from diagnostics.preprocessing.levels import CERTAIN_RATIO
 from diagnostics.preprocessing.offset import levelled, levels_above
-from diagnostics.sensor.rewiring import LIMIT, Test, candidates_of, events_of
+from diagnostics.sensor.rewiring import LIMIT, Rewiring, Test, candidates_of, events_of
 
 if TYPE_CHECKING:
     from diagnostics.evidence.reference import Reference
@@ -90,39 +91,18 @@ def find_swapped_in_part(
         reference: of the array, fitted.
         layout: the array.
     """
-    if reference.model is None or len(recordings) < _FEWEST:
+    scored = _ByRecording.of(recordings, reference, layout)
+    if scored is None:
         return None
-    present = layout.present.ravel()
-    levels = levels_above(recordings, reference.scale, present, reference.offset)
-    events: list[Floats] = []
-    of: list[int] = []
-    most = max(2, min(_EVENTS, _ALL_EVENTS // len(recordings)))
-    for i, frames in enumerate(levelled(recordings, levels)):
-        found = _of_each_pad(events_of([frames], reference.scale)[0], most, reference, layout)
-        events += found
-        of += [i] * len(found)
-    if len(set(of)) < _FEWEST:
-        return None
-    moved = np.ptp(np.concatenate(events), axis=0) > reference.scale.near
-    test = Test(events, np.ones(len(events)), reference.model, reference.scale, present, moved)
-    nobody = np.zeros(layout.n_cells, bool)
-
-    def likely(source: Cells) -> Floats:
-        by_recording = np.full(len(recordings), np.nan)
-        of_events = test.of_working(source, nobody)
-        for i in set(of):
-            by_recording[i] = of_events[np.equal(of, i)].sum()
-        return by_recording
-
     as_they_came = np.arange(layout.n_cells)
-    usual = likely(as_they_came)
+    usual = scored.likely(as_they_came)
     if np.nanmedian(usual) - np.nanmin(usual) < LIMIT:
         return None
-    surplus = test.score(as_they_came, ~moved).surplus
+    surplus = scored.test.score(as_they_came, ~scored.test.used).surplus
     candidates = list(candidates_of(layout, surplus, as_they_came))
     if not candidates:
         return None
-    gains = np.stack([likely(one.source) - usual for one in candidates])
+    gains = np.stack([scored.likely(one.source) - usual for one in candidates])
     exchanged = gains >= LIMIT
     totals = np.where(exchanged, gains, 0.0).sum(axis=1)
     best = int(totals.argmax())
@@ -148,6 +128,65 @@ def find_swapped_in_part(
     return SwappedInPart(
         candidates[best].source, candidates[best].text, recordings_of, len(recordings)
     )
+
+
+def newest_contradict(
+    rewiring: Rewiring, recordings: Sequence[Floats], reference: Reference, layout: SensorLayout
+) -> bool:
+    """Return whether the newest recordings, however many, are clearly less likely with the wiring
+    put back. Arguments as of :func:`find_swapped_in_part`; the recordings as they came."""
+    scored = _ByRecording.of(recordings, reference, layout)
+    if scored is None:
+        return True
+    gained = scored.likely(rewiring.source) - scored.likely(np.arange(layout.n_cells))
+    of_newest = np.nancumsum(gained[::-1])
+    return bool(of_newest.min() < -CERTAIN_RATIO)
+
+
+@dataclass(frozen=True)
+class _ByRecording:
+    """Scores each recording of a log under a permutation.
+
+    Attributes:
+        test: of a few events of each recording.
+        recording_of: the recording of each event.
+        n: number of recordings.
+    """
+
+    test: Test
+    recording_of: list[int]
+    n: int
+
+    @classmethod
+    def of(
+        cls, recordings: Sequence[Floats], reference: Reference, layout: SensorLayout
+    ) -> _ByRecording | None:
+        """Return the scores of a log; None where it has too few recordings with events."""
+        if reference.model is None or len(recordings) < _FEWEST:
+            return None
+        present = layout.present.ravel()
+        levels = levels_above(recordings, reference.scale, present, reference.offset)
+        events: list[Floats] = []
+        of: list[int] = []
+        most = max(2, min(_EVENTS, _ALL_EVENTS // len(recordings)))
+        for i, frames in enumerate(levelled(recordings, levels)):
+            found = _of_each_pad(events_of([frames], reference.scale)[0], most, reference, layout)
+            events += found
+            of += [i] * len(found)
+        if len(set(of)) < _FEWEST:
+            return None
+        moved = np.ptp(np.concatenate(events), axis=0) > reference.scale.near
+        weight = np.ones(len(events))
+        test = Test(events, weight, reference.model, reference.scale, present, moved)
+        return cls(test, of, len(recordings))
+
+    def likely(self, source: Cells) -> Floats:
+        """Return the log likelihood of each recording, ``[n]``; NaN: it has no event."""
+        by_recording = np.full(self.n, np.nan)
+        of_events = self.test.of_working(source, np.zeros(len(source), bool))
+        for i in set(self.recording_of):
+            by_recording[i] = of_events[np.equal(self.recording_of, i)].sum()
+        return by_recording
 
 
 def _of_each_pad(

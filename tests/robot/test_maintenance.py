@@ -336,6 +336,18 @@ def test_a_replaced_pad_is_recalibrated_without_labels(bundle, later_grasps, mon
     ).replaced_pads
 
 
+@pytest.mark.usefixtures("worthwhile")
+@pytest.mark.parametrize("replaced", [(0, 12), (12, 24)])
+def test_a_pad_that_reads_otherwise_in_half_of_a_log_is_not_recalibrated(
+    bundle, later_grasps, monkeypatch, replaced
+):
+    monkeypatch.setattr(SelfDiagnosis, "rewiring", lambda *given: None)
+    changed = slice(*replaced)
+    log = list(later_grasps)
+    log[changed] = as_another_specimen(log[changed], bundle.layout, pad=1)
+    assert not maintain(bundle, log).replaced_pads or bundle.versions.numbers == [1]
+
+
 def test_one_bad_recording_does_not_stop_the_others(bundle, later_grasps, broken_row):
     log = [later_grasps[0][:, :7], *broken(later_grasps, broken_row)]
     report = maintain(bundle, log, names=["short.csv"])
@@ -441,6 +453,28 @@ def test_exchanged_rows_are_undone_in_software_and_the_robot_predicts_as_before(
         label
         == Predictor.load(bundle.path).predict(scale(swapped[0][-10:], bundle.layout)[None])[0]
     )
+
+
+@pytest.mark.usefixtures("worthwhile")
+@pytest.mark.parametrize("exchanged", [(0, 8), (0, 12), (12, 24), (0, 20)])
+def test_wires_that_not_each_half_of_a_log_shows_exchanged_are_not_undone(
+    bundle, later_grasps, exchanged
+):
+    changed = slice(*exchanged)
+    log = list(later_grasps)
+    log[changed] = exchanged_rows(log[changed], bundle)
+    report = maintain(bundle, log)
+    assert report.decision != "deployed"
+    assert bundle.versions.numbers == [1]
+
+
+@pytest.mark.usefixtures("worthwhile")
+def test_a_log_too_short_for_two_halves_names_exchanged_rows_and_how_many_recordings_undo_them(
+    bundle, later_grasps
+):
+    report = maintain(bundle, exchanged_rows(later_grasps[:8], bundle))
+    assert (report.decision, report.version, report.exit_code) == ("kept", 1, 2)
+    assert "8 recordings do not prove it, record at least 12" in report.reason
 
 
 @pytest.mark.usefixtures("worthwhile")

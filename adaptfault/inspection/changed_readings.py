@@ -138,17 +138,29 @@ def find_changed_readings(
             back.
     """
     exchanged = _put_back(diagnoser, frames)
-    if exchanged is not None and not disturbed:
-        return exchanged
     as_found = ChangedReadings(None, None, frames, diagnoser.diagnose(frames))
-    if disturbed:
-        if exchanged is not None and exchanged.diagnosis.n_lost < as_found.diagnosis.n_lost:
-            return exchanged
+    if disturbed and (exchanged is None or exchanged.diagnosis.n_lost >= as_found.diagnosis.n_lost):
         return as_found
-    recalibration = _recalibration(diagnoser, frames, healthy, as_found.diagnosis)
+    replaced = _with_new_gains(diagnoser, as_found, healthy, exchanged)
+    if replaced is None:
+        return exchanged or as_found
+    return as_found if disturbed else replaced
+
+
+def _with_new_gains(
+    diagnoser: SelfDiagnosis,
+    as_found: ChangedReadings,
+    healthy: Sequence[NDArray[Any]],
+    exchanged: ChangedReadings | None,
+) -> ChangedReadings | None:
+    """Return a log with replaced pads undone; None where none is, or where exchanged wires explain
+    the log better."""
+    rival = None if exchanged is None else exchanged.frames
+    recalibration = _recalibration(diagnoser, as_found, healthy, rival)
     if recalibration is None:
-        return as_found
-    undone = [recalibration.undo(recording, diagnoser.layout.full_scale) for recording in frames]
+        return None
+    full_scale = diagnoser.layout.full_scale
+    undone = [recalibration.undo(recording, full_scale) for recording in as_found.frames]
     return ChangedReadings(None, recalibration, undone, diagnoser.diagnose(undone), as_found)
 
 
@@ -202,9 +214,14 @@ def as_loads(diagnoser: SelfDiagnosis, recordings: Sequence[NDArray[Any]]) -> li
 
 
 def _recalibration(
-    diagnoser: SelfDiagnosis, frames: Frames, healthy: Sequence[NDArray[Any]], diagnosis: Diagnosis
+    diagnoser: SelfDiagnosis,
+    as_found: ChangedReadings,
+    healthy: Sequence[NDArray[Any]],
+    rival: Frames | None,
 ) -> Recalibration | None:
-    """Return how replaced pads read; None where none is replaced."""
+    """Return how replaced pads read; None where none is replaced, or ``rival``, the log with wires
+    put back, is more likely."""
+    diagnosis = as_found.diagnosis
     if diagnoser.load_ is not None or diagnoser.reference_ is None or not healthy:
         return None
     # Many cells of a new pad have other gains and offsets. Other faulty cells tell nothing of it.
@@ -218,4 +235,12 @@ def _recalibration(
         if (on & otherwise).sum() > LEAST_LOADED * on.sum():
             faulty[on & otherwise] = False
     held = diagnosis.statically_loaded.mask
-    return find_recalibration(frames, healthy, diagnoser.reference_, diagnoser.layout, faulty, held)
+    return find_recalibration(
+        as_found.frames,
+        healthy,
+        diagnoser.reference_,
+        layout,
+        faulty,
+        held,
+        rival=rival,
+    )

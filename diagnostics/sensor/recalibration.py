@@ -16,7 +16,8 @@ comedian of the halves, which a few faulty cells do not raise; Falk 1997) of hal
 of full scale. Another task changes the loads of all cells alike; a strap gives neighbours alike
 offsets, those of a new pad are independent. The correction must also raise the pseudo-likelihood of
 recordings that it was not learned from, by more than four standard errors over these recordings; by
-two in the older and in the newer half, where it is to be undone.
+two in the older and in the newer half, where it is to be undone. Exchanged wires, once put back,
+must not raise it more.
 
 Not detected: other noise, other thresholds, and gains of cells that no event loads: these take the
 mean of their pad.
@@ -25,7 +26,7 @@ mean of their pad.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -109,6 +110,8 @@ def find_recalibration(
     layout: SensorLayout,
     excluded: Mask,
     statically_loaded: Mask,
+    *,
+    rival: Sequence[NDArray[Any]] | None = None,
 ) -> Recalibration | None:
     """Return gains and offsets of the pads that read otherwise; None where none does, or the data
     do not tell.
@@ -121,6 +124,7 @@ def find_recalibration(
         excluded: bool ``[D]``, cells that are faulty.
         statically_loaded: bool ``[D]``, cells under an object. Its pad was replaced only if the
             other cells read otherwise too.
+        rival: the recordings with wires put back, which must not explain the log better.
     """
     used = layout.present.ravel() & ~excluded & (reference.dead == 0)
     new = [filled for r in recordings if (filled := _filled(r, reference)) is not None]
@@ -154,6 +158,8 @@ def find_recalibration(
     log_gain, offset = fit.learned(new)
     gain = np.ones_like(log_gain)
     rest = reference.scale.baseline
+    if rival is not None and fit.prefers(rival, halves, of_halves, [differing[i] for i in certain]):
+        return None
     replaced = []
     throughout = True
     moved = np.zeros_like(offset)
@@ -246,6 +252,27 @@ class _Fit:
         by_offset = _common_spread(one[1], other[1], on)
         slight = SLIGHT * self.reference.scale.full_scale
         return bool(by_gain >= np.log(GAIN) / 2 or by_offset >= slight / 2)
+
+    def prefers(
+        self,
+        rival: Sequence[NDArray[Any]],
+        halves: tuple[Sequence[Floats], Sequence[Floats]],
+        of_halves: Sequence[Learned],
+        pads: Sequence[Mask],
+    ) -> bool:
+        """Return whether other recordings, of the same log, are more likely than its halves with
+        the gains and offsets of some pads that were learned from the other half.
+
+        Cells that count as faulty are scored too: wires that are exchanged make them so.
+        """
+        everywhere = replace(self, used=self.layout.present.ravel() & (self.reference.dead == 0))
+        on = np.any(pads, axis=0)
+        ours = 0.0
+        for (log_gain, offset), other in zip(of_halves, halves[::-1], strict=True):
+            ours += everywhere.scores(other, log_gain * on, offset * on).sum()
+        put_back = [one for r in rival if (one := _filled(r, self.reference)) is not None]
+        nothing = np.zeros(self.layout.n_cells)
+        return bool(everywhere.scores(put_back, nothing, nothing).sum() > ours)
 
     def learned(self, recordings: Sequence[Floats]) -> Learned:
         """Return log gain and offset of each cell, ``[D]``; the offset in the layout's unit, of the

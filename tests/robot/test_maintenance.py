@@ -19,7 +19,7 @@ from adaptfault.robot.maintenance import maintain
 from adaptfault.robot.maintenance_report import MaintenanceReport
 from adaptfault.robot.model_comparison import Judgement
 from adaptfault.robot.sensor_state import SensorState, weak_base
-from diagnostics import FaultKind, FaultSet, Line, SelfDiagnosis, SensorLayout, inject, line_fault
+from diagnostics import FaultKind, FaultSet, Line, SensorLayout, inject, line_fault
 
 LAYOUT = SensorLayout(2, 6, 5)
 
@@ -291,18 +291,13 @@ def as_another_specimen(recordings, layout, pad, seed=0):
     return [np.clip(gain * r + offset, 0, layout.full_scale) for r in recordings]
 
 
-def test_a_replaced_pad_that_costs_nothing_is_told_and_not_undone(
-    bundle, later_grasps, monkeypatch
-):
-    monkeypatch.setattr(SelfDiagnosis, "rewiring", lambda *given: None)
+def test_a_replaced_pad_that_costs_nothing_is_told_and_not_undone(bundle, later_grasps):
     report = maintain(bundle, as_another_specimen(later_grasps, bundle.layout, pad=1))
     assert (report.decision, report.exit_code) == ("unchanged", 1)
     assert "not undone: version 1 is as good without it" in str(report)
 
 
 def test_a_replaced_pad_is_recalibrated_without_labels(bundle, later_grasps, monkeypatch):
-    # on 30 cells, gains look like exchanged rows
-    monkeypatch.setattr(SelfDiagnosis, "rewiring", lambda *given: None)
     # three classes are told apart by any gains: here they are not
     judged = maintenance._judged_readings
     monkeypatch.setattr(
@@ -339,9 +334,8 @@ def test_a_replaced_pad_is_recalibrated_without_labels(bundle, later_grasps, mon
 @pytest.mark.usefixtures("worthwhile")
 @pytest.mark.parametrize("replaced", [(0, 12), (12, 24)])
 def test_a_pad_that_reads_otherwise_in_half_of_a_log_is_not_recalibrated(
-    bundle, later_grasps, monkeypatch, replaced
+    bundle, later_grasps, replaced
 ):
-    monkeypatch.setattr(SelfDiagnosis, "rewiring", lambda *given: None)
     changed = slice(*replaced)
     log = list(later_grasps)
     log[changed] = as_another_specimen(log[changed], bundle.layout, pad=1)

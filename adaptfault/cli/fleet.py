@@ -16,7 +16,11 @@ from adaptfault.cli.options import (
     say,
     trust,
 )
-from adaptfault.cli.paths import Read, Written, WrittenFolder, refuse_overwriting
+from adaptfault.cli.paths import Read, Written, refuse_overwriting, written_into
+
+_REPORT = "report.json"
+_PAGE = "report.html"
+_OUT = written_into("ledger.jsonl", "run.lock", _REPORT, _PAGE)
 
 _EXAMPLE = """  adaptfault fleet maintain FLEET.toml --jobs 8
       FLEET.toml lists robots as [[robots]] with name, bundle, recordings
@@ -64,7 +68,7 @@ def add(commands: Commands) -> None:
     )
     parser.add_argument(
         "--out",
-        type=WrittenFolder,
+        type=_OUT,
         metavar="FOLDER",
         help="of ledger and reports (default: FLEET.fleet)",
     )
@@ -96,7 +100,7 @@ def run(args: argparse.Namespace) -> int:
 
     fleet = Fleet.read(args.fleet)
     if not args.out:
-        args.out = WrittenFolder(Path(args.fleet).with_suffix(".fleet"))
+        args.out = _OUT(Path(args.fleet).with_suffix(".fleet"))
     refuse_overwriting(args, fleet.paths())
     folder = Path(args.out)
     report = maintain_fleet(
@@ -111,14 +115,12 @@ def run(args: argparse.Namespace) -> int:
         sign=args.sign,
         progress=progress(args),
     )
-    atomic_write(
-        folder / "report.json", json.dumps(report.to_dict(), indent=1, allow_nan=False).encode()
-    )
+    atomic_write(folder / _REPORT, json.dumps(report.to_dict(), indent=1, allow_nan=False).encode())
     if args.metrics:
         from adaptfault.robot.metrics import write_metrics
 
         write_metrics(args.metrics, report.metrics())
-    page = report.write_page(folder / "report.html")
+    page = report.write_page(folder / _PAGE)
     say(args, f"report: {page}")
     emit(args, report.to_dict(), str(report))
     return report.exit_code

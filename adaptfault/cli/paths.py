@@ -45,6 +45,21 @@ class WrittenFolder(Written):
     """A folder that a command writes into, made with the missing ones above it."""
 
 
+class WrittenInto(WrittenFolder):
+    """A folder that keeps what else it holds: a command adds some files to it, or replaces these.
+
+    Attributes:
+        files: their names.
+    """
+
+    files: tuple[str, ...] = ()
+
+
+def written_into(*files: str) -> type[WrittenInto]:
+    """Return the type of an option with a folder into which a command writes these files."""
+    return type("WrittenInto", (WrittenInto,), {"files": files})
+
+
 class WrittenRecordings(Written):
     """Recordings that a command writes: a file, or a folder."""
 
@@ -110,6 +125,11 @@ def _conflict(output: str, given: str, held: Callable[[str], set[Identity]]) -> 
     place = _identity(output)
     if place is not None and place == _identity(given):
         return "is read by this command"
+    if isinstance(output, WrittenInto) and _identity(given) not in _above(output):
+        for name in output.files:
+            if _identity(os.path.join(output, name)) == _identity(given):
+                return f"{name} would be written there, which is read"
+        return None
     if place in _above(given):
         return f"holds {given}, which is read"
     if not os.path.isdir(given):

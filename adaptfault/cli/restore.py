@@ -7,7 +7,10 @@ import json
 from pathlib import Path
 
 from adaptfault.cli.options import Commands, add_trust, command, emit, report_problems, say, trust
-from adaptfault.cli.paths import Read, Stated, WrittenFolder
+from adaptfault.cli.paths import Read, Stated, written_into
+
+_RESTORED = "restored.npz"
+_ABOUT = "restored.json"
 
 _EXAMPLE = """  adaptfault restore today/ --bundle robot.bundle --out restored/
       writes restored.npz, readable by every command,
@@ -35,7 +38,11 @@ def add(commands: Commands) -> None:
         help="folder with the healthy windows of the array",
     )
     parser.add_argument(
-        "--out", type=WrittenFolder, required=True, metavar="FOLDER", help="folder to write"
+        "--out",
+        type=written_into(_RESTORED, _ABOUT),
+        required=True,
+        metavar="FOLDER",
+        help="folder to write",
     )
     parser.add_argument(
         "--faults",
@@ -80,7 +87,7 @@ def run(args: argparse.Namespace) -> int:
     deviation = restorer.deviation(faults)
     folder = Path(args.out)
     folder.mkdir(parents=True, exist_ok=True)
-    save_npz(folder / "restored.npz", Recordings(tuple(restored), layout, names=incoming.names))
+    save_npz(folder / _RESTORED, Recordings(tuple(restored), layout, names=incoming.names))
     result = {
         "schema": "adaptfault.restore/1",
         "recordings": len(restored),
@@ -88,10 +95,10 @@ def run(args: argparse.Namespace) -> int:
         "unit": layout.unit,
         "deviation": {str(cell): float(deviation[cell]) for cell in faults},
         "missing_readings": missing,
-        "restored": str(folder / "restored.npz"),
+        "restored": str(folder / _RESTORED),
     }
     about = json.dumps(result, indent=1, allow_nan=False)
-    atomic_write(folder / "restored.json", about.encode())
+    atomic_write(folder / _ABOUT, about.encode())
     typical = (
         f", typical deviation {np.median(deviation[list(faults)]):.3g} {layout.unit}"
         if len(faults)

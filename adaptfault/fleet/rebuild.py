@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import is_dataclass
+from dataclasses import MISSING, Field, fields, is_dataclass
 from types import UnionType
 from typing import Any, Union, get_args, get_origin, get_type_hints
 
@@ -17,7 +17,7 @@ def rebuilt(value: Any, kind: Any, names: Mapping[str, Any] | None = None) -> An
         names: what names stand for that only a type checker imports.
 
     Raises:
-        ValueError: a field is missing, unknown or of another type.
+        ValueError: a field without a default is missing, or one is unknown or of another type.
     """
     if get_origin(kind) in (Union, UnionType):
         return _of_union(value, get_args(kind), names)
@@ -45,6 +45,11 @@ def _of_union(value: Any, kinds: tuple[Any, ...], names: Mapping[str, Any] | Non
 
 def _of_dataclass(value: Any, kind: Any, names: Mapping[str, Any] | None) -> Any:
     types = get_type_hints(kind, localns=dict(names or {}))
-    if not isinstance(value, Mapping) or set(value) != set(types):
+    needed = {one.name for one in fields(kind) if _is_needed(one)}
+    if not isinstance(value, Mapping) or not needed <= set(value) <= set(types):
         raise ValueError(f"expected the fields {', '.join(types)}, got {str(value)[:60]!r}")
-    return kind(**{name: rebuilt(value[name], types[name], names) for name in types})
+    return kind(**{name: rebuilt(value[name], types[name], names) for name in value})
+
+
+def _is_needed(one: Field[Any]) -> bool:
+    return one.default is MISSING and one.default_factory is MISSING

@@ -14,7 +14,7 @@ import struct
 import zipfile
 import zlib
 from collections.abc import Mapping
-from dataclasses import MISSING, fields, is_dataclass
+from dataclasses import fields, is_dataclass
 from io import BytesIO
 from pathlib import Path
 from types import NoneType, UnionType
@@ -105,9 +105,9 @@ def _read(kind: Any, about: Any, arrays: Mapping[str, ArrayLike], name: str) -> 
         if not isinstance(about, Mapping):
             raise TypeError(f"expected the fields of {name}, got {about!r}")
         hints = get_type_hints(kind)
-        # What an earlier version did not write keeps its default.
-        known = [f.name for f in fields(kind) if f.name in about or f.default is MISSING]
-        return kind(**{name: _read(hints[name], about[name], arrays, name) for name in known})
+        return kind(
+            **{f.name: _read(hints[f.name], about[f.name], arrays, f.name) for f in fields(kind)}
+        )
     if isinstance(about, bool) != (kind is bool) or not isinstance(about, int | float | str):
         raise TypeError(f"expected {kind.__name__} for {name}, got {about!r}")
     return kind(about)

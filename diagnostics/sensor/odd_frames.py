@@ -41,6 +41,7 @@ _AGREES = 0.25  # of the median jump, by which a cell may jump otherwise in a sp
 _BEYOND = 1.5  # times the highest reading of usual frames
 _SAMPLE = 64  # usual frames, whose loads are compared with their neighbours: a size
 _BLOCK = 1 << 20  # readings that are looked at together: a size
+_LARGEST = float(np.finfo(np.float32).max)
 _MOST = 4000  # frames from which the cell that follows each is found: a size
 
 Kind = Literal["corrupt", "spike"]
@@ -169,9 +170,9 @@ def without_odd_frames(
 
 
 def _finite(frames: NDArray[Any]) -> Floats:
-    """Return frames ``[T, D]`` with NaN for what is infinite."""
+    """Return frames ``[T, D]`` with NaN for what is infinite, or too large for a difference."""
     finite = np.array(frames, dtype=np.float64)
-    finite[~np.isfinite(finite)] = np.nan
+    finite[~(np.abs(finite) <= _LARGEST)] = np.nan
     return finite
 
 

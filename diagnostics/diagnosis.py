@@ -199,7 +199,7 @@ class SelfDiagnosis:
         log = checked_recordings(recordings, self.layout)
         with one_thread():
             given = measured(log, self.layout)
-            self.copies_ = find_copies(given)
+            self.copies_ = find_copies(given, self.layout.present.ravel())
             independent = np.unique(self.copies_)
             chosen = RecordingBlocks([given[i] for i in independent])
             self._fit(chosen, progress, strict=strict)

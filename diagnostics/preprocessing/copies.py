@@ -40,11 +40,14 @@ _OVERLAP = 0.5  # of the shorter recording
 Floats = NDArray[np.floating[Any]]
 
 
-def find_copies(recordings: Sequence[Floats]) -> NDArray[np.intp]:
+def find_copies(
+    recordings: Sequence[Floats], present: NDArray[np.bool_] | None = None
+) -> NDArray[np.intp]:
     """Return for each recording the longest one that it is a copy of, or itself, int ``[n]``.
 
     Args:
         recordings: ``[T, D]`` each; NaN = missing.
+        present: bool ``[D]``, where there is a cell; None: everywhere.
     """
     n = len(recordings)
     own = np.arange(n)
@@ -53,7 +56,7 @@ def find_copies(recordings: Sequence[Floats]) -> NDArray[np.intp]:
         return own
     # what no converter sends is like nothing else
     with np.errstate(over="ignore", invalid="ignore"):
-        loads = _Loads(recordings, kept)
+        loads = _Loads(recordings, kept, present)
         links = _identical(loads, kept)
         for i, j, shift in _pairs(loads, kept):
             if _same(loads.of(i), loads.of(j), shift, loads.tolerance):
@@ -76,10 +79,17 @@ class _Loads:
     Args:
         recordings: ``[T, D]`` each.
         kept: numbers of those with frames.
+        present: bool ``[D]``, where there is a cell; None: everywhere.
     """
 
-    def __init__(self, recordings: Sequence[Floats], kept: Sequence[int]) -> None:
+    def __init__(
+        self,
+        recordings: Sequence[Floats],
+        kept: Sequence[int],
+        present: NDArray[np.bool_] | None,
+    ) -> None:
         self._recordings = recordings
+        self._absent = None if present is None or present.all() else ~present
         some = [recordings[i][:: max(1, len(recordings[i]) // 16)] for i in kept]
         self._rest = _rest(some)
         readings = sum(recordings[i].size for i in kept)
@@ -100,6 +110,8 @@ class _Loads:
 
     def _away(self, readings: Floats) -> NDArray[np.float32]:
         away = (readings - self._rest).astype(np.float32)
+        if self._absent is not None:
+            away[..., self._absent] = 0  # such a position may read anything
         return np.nan_to_num(away, posinf=0, neginf=0)
 
 

@@ -300,26 +300,46 @@ class _Test:
         if kind is not None:
             jumped = self._present & (np.abs(jumps) > self._usual.least)
             return kind, tuple(np.unique(self._layout.pad_of[jumped]).tolist())
-        of_pads = [
-            self._kind(jumps, frame, self._present & (self._layout.pad_of == pad), at_end)
+        # One pad of several that jumps to one reading, or by one amount, has a bus that fails: it
+        # is judged as its group.
+        pads = tuple(
+            pad
             for pad in range(self._layout.pads)
-        ]
-        pads = tuple(pad for pad, one in enumerate(of_pads) if one is not None)
-        return (of_pads[pads[0]], pads) if pads else (None, ())
+            if self._is_scrambled(jumps, frame, self._present & (self._layout.pad_of == pad))
+        )
+        return ("corrupt", pads) if pads else (None, ())
+
+    def _jumped(self, jumps: Floats, read: Mask) -> Mask | None:
+        """Return which of some cells jumped, bool ``[D]``; None: too few."""
+        jumped = read & (np.abs(jumps) > self._usual.least)
+        return jumped if jumped.sum() >= max(_FEWEST, LEAST_LOADED * read.sum()) else None
+
+    def _is_scrambled(self, jumps: Floats, frame: Floats, on: Mask) -> bool:
+        """Return whether what some cells (bool ``[D]``) read agrees neither with their neighbours
+        nor with one reading, nor with one jump."""
+        read = on & np.isfinite(frame)
+        jumped = self._jumped(jumps, read)
+        if jumped is None or len(np.unique(frame[read])) == 1:
+            return False
+        return not self._is_spike(jumps, jumped, read) and self._disagrees(frame, jumped, read)
+
+    @staticmethod
+    def _is_spike(jumps: Floats, jumped: Mask, read: Mask) -> bool:
+        """Return whether most cells jumped by the same amount."""
+        typical = float(np.median(jumps[read]))
+        alike = np.abs(jumps[read] - typical) <= _AGREES * abs(typical)
+        most = jumped.sum() >= MAJORITY * read.sum()
+        return bool(most and alike.mean() >= 1 - LEAST_LOADED)
 
     def _kind(self, jumps: Floats, frame: Floats, on: Mask, at_end: bool) -> Kind | None:
         """Return what a candidate is of some cells (bool ``[D]``)."""
-        usual = self._usual
         read = on & np.isfinite(frame)
-        jumped = read & (np.abs(jumps) > usual.least)
-        count = int(jumped.sum())
-        if count < max(_FEWEST, LEAST_LOADED * read.sum()):
+        jumped = self._jumped(jumps, read)
+        if jumped is None:
             return None
         if self._is_one_number(frame[read], read, at_end):
             return "corrupt"
-        typical = float(np.median(jumps[read]))
-        alike = np.abs(jumps[read] - typical) <= _AGREES * abs(typical)
-        if count >= MAJORITY * read.sum() and alike.mean() >= 1 - LEAST_LOADED:
+        if self._is_spike(jumps, jumped, read):
             return "spike"
         if (frame[read] > _BEYOND * self._highest).mean() > MAJORITY:
             return "corrupt"
@@ -396,7 +416,7 @@ def evenly(
 
 def _followers(sample: Floats) -> NDArray[np.intp]:
     """Return which other cell's readings follow those of each cell best, ``[D]``; -1: none."""
-    ranged = np.nan_to_num(sample - np.nanmedian(sample, axis=0))
+    ranged = np.nan_to_num(sample - known_quantile(sample, 0.5, axis=0))
     spread = ranged.std(axis=0)
     moves = spread > 0
     scaled = np.where(moves, ranged / np.where(moves, spread, 1.0), 0.0).astype(np.float32)

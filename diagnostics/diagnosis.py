@@ -549,7 +549,7 @@ class SelfDiagnosis:
             yield
         found = replace(found, weight=weight).of(self._place)
         causes, possible = root_causes(found, aliases, self.layout)
-        unused = self._unused(stream, found.alive, causes)
+        unused = self._unused(stream, found.alive, causes, contradicted=life.contradicting > 0)
         if unused.any():
             found = found.without(unused)
             causes, possible = root_causes(found, aliases, self.layout)
@@ -629,14 +629,22 @@ class SelfDiagnosis:
         return life
 
     def _unused(
-        self, stream: StreamState, alive: NDArray[np.bool_], causes: Sequence[Fault]
+        self,
+        stream: StreamState,
+        alive: NDArray[np.bool_],
+        causes: Sequence[Fault],
+        *,
+        contradicted: bool,
     ) -> NDArray[np.bool_]:
         """Return the cells that are blamed although nothing may have touched their pad, and those
         at rest beside them, bool ``[D]``. Most logs leave some pad alone and blame no cell of it.
+
+        ``contradicted``: so many cells contradict what the others say that none is blamed for it.
         """
         unused = stream.unused(alive[self._order])[self._place]
         blamed = np.zeros_like(unused)
         blamed[[cell for fault in causes for cell in fault.cells]] = True
+        blamed |= contradicted
         pad = self.layout.pad_of
         return np.asarray(unused & np.isin(pad, pad[unused & blamed]))
 

@@ -2,9 +2,10 @@
 cover, another supply or heavier objects.
 
 The load of a recording is the upper quartile, over the cells that move in it, of highest less low
-reading. The gain is the ratio of the median loads of log and reference; it is 1 where the test of
-Kolmogorov and Smirnov finds no difference (p < 1e-4), and between 1 / 1.3 and 1.3. Cells are judged
-after it is taken out, where that explains more of them.
+reading, both above the median of all cells in the frame. The gain is the ratio of the median loads
+of log and reference; it is 1 where the test of Kolmogorov and Smirnov finds no difference
+(p < 1e-4), and between 1 / 1.3 and 1.3. Cells are judged after it is taken out, where that explains
+more of them.
 
 Not detected: fewer than five recordings with contact, and a gain that comes and goes.
 """
@@ -18,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from diagnostics.evidence.drift import GAIN
-from diagnostics.preprocessing.levels import LEAST_LOADED, LOW
+from diagnostics.preprocessing.levels import LEAST_LOADED, LOW, MAJORITY
 from diagnostics.preprocessing.quantiles import known_quantile
 from diagnostics.sensor.sensor_change import differ
 
@@ -38,6 +39,8 @@ def loads_of(recordings: Sequence[NDArray[Any]], near: float, present: NDArray[n
         frames = np.asarray(given, dtype=np.float64)[:, present]
         if not len(frames):
             continue
+        # A hum or a ramp of all cells is no load.
+        frames = frames - known_quantile(frames, MAJORITY, axis=1)[:, None]
         size = np.fmax.reduce(frames) - known_quantile(frames, LOW, axis=0)
         moving = size[size > 2 * near]
         if len(moving):

@@ -71,9 +71,9 @@ def test_it_writes_page_badge_json_and_validity(data_set, tmp_path, capsys):
     text = capsys.readouterr().out
     assert "recordings" in text
     assert "row 1, column 3" not in text
-    assert "pad 1, row 2, column 4 is short" in text
-    assert "pad 1, row 2, column 4 is short" in outputs["a.html"].read_text()
-    assert "row 1, column 3 is short" in outputs["a.json"].read_text()
+    assert "pad 1, row 2, column 4 (cell7) is short" in text
+    assert "pad 1, row 2, column 4 (cell7) is short" in outputs["a.html"].read_text()
+    assert "row 1, column 3 (cell7) is short" in outputs["a.json"].read_text()
     assert "11 of 12 cells" in outputs["a.svg"].read_text()
     with np.load(outputs["valid.npz"]) as archive:
         valid = archive["valid"].reshape(40, -1, 12)

@@ -62,10 +62,10 @@ def test_one_graph_serves_every_fault_set_and_number_of_known_windows(
 ):
     network = Adaptation.load(versions["whole"]).model.network
     monkeypatch.setattr(torch.onnx, "export", None)  # from here on the exporter is not there
-    x = small_windows(5)
     for n, cells in ((40, ()), (50, (3,)), (50, (0, 4, 9, 10, 11, 17))):
         head = with_a_head(network, n, cells)
         assert head.model.head is not None
+        x = small_windows(5)
         x[..., list(cells)] = np.nan
         said = run_session(open_session(to_onnx(head.model, small_graph)), x)
         np.testing.assert_allclose(said, head.predict_proba(x), rtol=0, atol=1e-5)

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from diagnostics.evidence.life.folds import Fold
-from diagnostics.evidence.life.healthy_table import FEWEST_CELLS, UNLOADED, Floats, Mask, levels_of
+from diagnostics.evidence.life.healthy_table import UNLOADED, Floats, Mask, levels_of
 from diagnostics.evidence.life.levels_in_log import LifeLog
-from diagnostics.evidence.life.life_model import LifeModel, WireModel
+from diagnostics.evidence.life.life_model import LifeModel, WireModel, cells_on_lines
 from diagnostics.evidence.life.tables import (
     LEVELS,
     counts_of,
@@ -28,25 +28,11 @@ from diagnostics.preprocessing.levels import FEWEST
 
 if TYPE_CHECKING:
     from diagnostics.layout import SensorLayout
+    from diagnostics.wiring import LineKind
 
+# all but those of address bits
+_KINDS: tuple[LineKind, ...] = ("row", "column", "converter", "position", "bus", "group")
 _LEFT_OUT = 0.15  # most cells that are unknown in predictions, as in a log with dead ones
-
-
-def wires_of(layout: SensorLayout) -> Mask:
-    """Return the cells of each wire that others can tell of, bool ``[W, D]``: three of them at
-    least, and not all."""
-    present = layout.present.ravel()
-    found: dict[bytes, Mask] = {}
-    for line in layout.lines:
-        if line.kind in ("row_address", "column_address"):
-            continue
-        cells = layout.cells_on(line)
-        if FEWEST_CELLS <= len(cells) < present.sum():
-            on = np.zeros(layout.n_cells, bool)
-            on[cells] = True
-            found.setdefault(on.tobytes(), on)
-    every = np.array(list(found.values()))
-    return every.reshape(-1, layout.n_cells).astype(np.bool_)
 
 
 def fit_wires(
@@ -60,7 +46,7 @@ def fit_wires(
         folds: of the reference.
         layout: the array.
     """
-    on = wires_of(layout)
+    on = cells_on_lines(layout, _KINDS)
     if not len(on):
         return None, [None] * len(folds)
     present = layout.present.ravel()

@@ -23,9 +23,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from diagnostics.evidence.life.healthy_table import FEWEST_CELLS, STATES, Floats, Levels, Mask
+from diagnostics.evidence.life.healthy_table import STATES, Floats, Levels, Mask
 from diagnostics.evidence.life.levels_in_log import LevelLog, LifeLog
-from diagnostics.evidence.life.life_model import GroupModel, LifeModel
+from diagnostics.evidence.life.life_model import GroupModel, LifeModel, cells_on_lines
 from diagnostics.evidence.life.over_time import dies_and_recovers, from_some_unit
 from diagnostics.evidence.life.record import PIECE
 from diagnostics.evidence.life.tables import (
@@ -39,11 +39,12 @@ from diagnostics.preprocessing.levels import LEAST_LOADED, MAJORITY
 if TYPE_CHECKING:
     from diagnostics.evidence.life.folds import Fold
     from diagnostics.layout import SensorLayout
+    from diagnostics.wiring import LineKind
 
 _AS_ONE = 0.95  # of the pieces of a group that fails
 _FAILS = 0.02  # probability per piece
 _RECOVERS = 0.1  # probability per piece
-_KINDS = ("converter", "bus", "group")
+_KINDS: tuple[LineKind, ...] = ("converter", "bus", "group")
 
 
 def log_of(groups: GroupModel, log: LifeLog, eligible: Mask) -> tuple[LevelLog, Floats]:
@@ -128,19 +129,6 @@ def _first_frames(
     return since
 
 
-def groups_of(layout: SensorLayout) -> Mask:
-    """Return the cells of each group, bool ``[G, D]``: three of them at least, and not all."""
-    present = layout.present.ravel()
-    found: dict[bytes, Mask] = {}
-    for line in layout.lines:
-        cells = layout.cells_on(line)
-        if line.kind in _KINDS and FEWEST_CELLS <= len(cells) < present.sum():
-            on = np.zeros(layout.n_cells, bool)
-            on[cells] = True
-            found.setdefault(on.tobytes(), on)
-    return np.array(list(found.values())).reshape(-1, layout.n_cells).astype(np.bool_)
-
-
 def fit_groups(
     held_out: Sequence[LifeModel], folds: Sequence[Fold], layout: SensorLayout
 ) -> tuple[GroupModel | None, list[GroupModel | None]]:
@@ -153,7 +141,7 @@ def fit_groups(
         layout: the array.
     """
     present = layout.present.ravel()
-    on = groups_of(layout)
+    on = cells_on_lines(layout, _KINDS)
     if not len(on):
         return None, [None] * len(folds)
     constant = np.concatenate([fold.constant[:, present] for fold in folds])

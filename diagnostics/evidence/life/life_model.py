@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator, Sequence
+from collections.abc import Collection, Generator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -33,9 +33,25 @@ from diagnostics.preprocessing.scale import Array
 
 if TYPE_CHECKING:
     from diagnostics.layout import SensorLayout
+    from diagnostics.wiring import LineKind
 
 _STEPS = 4  # of a prediction: a size
 _NOISIER = 2  # single frames than their mean in a piece
+
+
+def cells_on_lines(layout: SensorLayout, kinds: Collection[LineKind]) -> Mask:
+    """Return the cells on each line of some kinds that others can tell of, bool ``[L, D]``: three
+    of them at least, and not all; lines with the same cells once."""
+    present = layout.present.ravel()
+    found: dict[bytes, Mask] = {}
+    for line in layout.lines:
+        cells = layout.cells_on(line)
+        if line.kind in kinds and FEWEST_CELLS <= len(cells) < present.sum():
+            on = np.zeros(layout.n_cells, bool)
+            on[cells] = True
+            found.setdefault(on.tobytes(), on)
+    every = np.array(list(found.values()))
+    return every.reshape(-1, layout.n_cells).astype(np.bool_)
 
 
 @dataclass(frozen=True)

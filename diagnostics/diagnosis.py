@@ -50,13 +50,17 @@ from diagnostics.preprocessing.levels import (
     DOUBTED,
     EXPECTED,
     LEAST_LOADED,
+    LOW,
     MAJORITY,
     RARE,
     SLIGHT,
 )
 from diagnostics.preprocessing.load import LoadDirection
+from diagnostics.preprocessing.quantiles import known_quantile
 from diagnostics.preprocessing.readings import RecordingBlocks
+from diagnostics.sensor.crosstalk import Crosstalk, find_crosstalk, lowest_floors
 from diagnostics.sensor.gain import gain_of, loads_of, without_gain
+from diagnostics.sensor.odd_frames import evenly
 from diagnostics.sensor.rewiring import Rewiring, find_rewiring
 from diagnostics.sensor.shared import Shared, measured
 from diagnostics.sensor.swapped_in_part import SwappedInPart, find_swapped_in_part
@@ -249,7 +253,8 @@ class SelfDiagnosis:
         self.reference_ = Reference.fit(healthy, layout, dead)
         near = self.reference_.scale.near
         usual = loads_of(healthy, near, living(layout, dead).present.ravel())
-        self.reference_ = replace(self.reference_, loads=usual)
+        floors = lowest_floors(healthy, self.reference_.scale.baseline, living(layout, dead))
+        self.reference_ = replace(self.reference_, loads=usual, floors=floors)
         if self.proof_of_life:
             self.reference_ = self.reference_.with_life(healthy, layout)
         if calibrator is None:
@@ -307,13 +312,51 @@ class SelfDiagnosis:
         Raises:
             ValueError: recordings that do not fit the layout, or hold no frame.
         """
-        shared = Shared.of(checked_recordings(recordings, self.layout), self.layout)
+        shared = self.shared(recordings)
         if shared.explains_all:
             return shared.diagnosis()
         log = RecordingBlocks(shared.recordings)
         with one_thread():
             own = self.for_log(log.given, classes=classes)
-            return shared.told(own._diagnosed_when(log, classes))
+            known = shared.crosstalk if own is self else None  # else it is learned
+            return shared.told(own._diagnosed_when(log, classes, known))
+
+    def shared(self, recordings: ArrayLike | Sequence[ArrayLike]) -> Shared:
+        """Return what the array as a whole does in a log, as :meth:`diagnose` takes it.
+
+        Raises:
+            ValueError: recordings that do not fit the layout, or hold no frame.
+        """
+        shared = Shared.of(checked_recordings(recordings, self.layout), self.layout)
+        return shared if shared.explains_all else shared.beside(self.crosstalk(shared.recordings))
+
+    def crosstalk(self, recordings: ArrayLike | Sequence[ArrayLike]) -> Crosstalk | None:
+        """Return the crosstalk of the lines of a log that the reference does not have; None without
+        it, and where there are no rows and columns, or cells rest in the middle.
+
+        Raises:
+            ValueError: recordings that do not fit the layout, or hold no frame.
+        """
+        loads = self._loads(checked_recordings(recordings, self.layout))
+        if loads is None or not self.layout.is_matrix:
+            return None
+        reference = self.reference_
+        if reference is None or reference.floors is None:
+            rest = known_quantile(evenly(loads), LOW, axis=0)
+            return find_crosstalk(loads, rest, np.zeros((2, self.layout.pads)), self.layout)
+        layout = replace(self.layout, full_scale=reference.scale.full_scale)
+        return find_crosstalk(loads, reference.scale.baseline, reference.floors, layout)
+
+    def _loads(self, log: RecordingBlocks) -> RecordingBlocks | None:
+        """Return the loads of a log; None where a cell rests in the middle, or has several axes."""
+        valid = log.valid(self.layout.full_scale, self.layout.present.ravel())
+        if self.layout.axes > 1:
+            return None
+        if self.load_ is None:
+            return valid
+        if self.load_.direction == "middle":
+            return None
+        return RecordingBlocks([self.load_.loads(recording) for recording in valid])
 
     def for_log(
         self,
@@ -403,16 +446,8 @@ class SelfDiagnosis:
 
     def _for_wiring(self, recordings: ArrayLike | Sequence[ArrayLike]) -> RecordingBlocks | None:
         """Return a log as loads; None where its wiring cannot be compared with a reference."""
-        log = checked_recordings(recordings, self.layout).valid(
-            self.layout.full_scale, self.layout.present.ravel()
-        )
-        if self.reference_ is None or self.layout.axes > 1:
-            return None
-        if self.load_ is None:
-            return log
-        if self.load_.direction == "middle":
-            return None
-        return RecordingBlocks([self.load_.loads(recording) for recording in log])
+        log = checked_recordings(recordings, self.layout)
+        return None if self.reference_ is None else self._loads(log)
 
     def state(self) -> tuple[dict[str, Any], Arrays]:
         """Return the fitted state: a JSON-safe dict and arrays by name, as :meth:`from_state` reads
@@ -569,6 +604,8 @@ class SelfDiagnosis:
             pulled = yield from self._pulled(stream, life, causes, inferred)
             causes = pulling(causes, pulled[self._place], self.layout)
         shown = (life.shown | (stream.reference.dead > 0)) & ~pulled
+        if stream.crosstalk is not None:
+            shown &= stream.crosstalk.own
         scale = stream.scale
         intermittency = stream.intermittency
         working = np.empty_like(inferred)
@@ -626,7 +663,7 @@ class SelfDiagnosis:
         # Cells that the spatial test suspects predict no others.
         suspected = spatial.scored & (found.faulty | stream.suspected(spatial))
         life = yield from stream.proof_of_life(evidence, explained, suspected, first).steps()
-        return life
+        return life if stream.crosstalk is None else life.undecided()
 
     def _unused(
         self,
@@ -692,11 +729,13 @@ class SelfDiagnosis:
         is_known = stream.load is not None or self.reference_ is not None
         return False if is_known or self.layout.rest != "learn" else None
 
-    def _judged(self, log: RecordingBlocks) -> Diagnosis:
+    def _judged(self, log: RecordingBlocks, crosstalk: Crosstalk | None) -> Diagnosis:
         """Return the diagnosis of a log, without a gain of the whole array where that explains
         faults."""
-        found = self._diagnosed(log)
-        usual = self.without_gain(log.given) if found.faults else None
+        found = self._diagnosed(log, crosstalk=crosstalk)
+        usual = None
+        if found.faults and crosstalk is None:
+            usual = self.without_gain(log.given)
         if usual is None:
             return found
         without = self._diagnosed(usual)
@@ -714,12 +753,9 @@ class SelfDiagnosis:
         """
         log = checked_recordings(recordings, self.layout)
         reference = self.reference_
-        if reference is None or reference.loads is None or self.layout.axes > 1:
+        loads = self._loads(log)
+        if loads is None or reference is None or reference.loads is None:
             return None
-        if self.load_ is not None and self.load_.direction == "middle":
-            return None
-        valid = log.valid(self.layout.full_scale, self.layout.present.ravel())
-        loads = valid if self.load_ is None else [self.load_.loads(frames) for frames in valid]
         scale = reference.scale
         present = living(self._planes, reference.dead).present.ravel()
         gain = gain_of(loads_of(loads, scale.near, present), reference.loads)
@@ -732,16 +768,22 @@ class SelfDiagnosis:
         return RecordingBlocks(usual)
 
     def _diagnosed(
-        self, log: RecordingBlocks, needed: NDArray[np.bool_] | None = None
+        self,
+        log: RecordingBlocks,
+        needed: NDArray[np.bool_] | None = None,
+        crosstalk: Crosstalk | None = None,
     ) -> Diagnosis:
         stream = self.stream(needed)
+        stream.crosstalk = crosstalk
         for frames in log.blocks():
             stream.extend(frames)
         return self.evaluate(stream, n_recordings=len(log))
 
-    def _diagnosed_when(self, log: RecordingBlocks, classes: ArrayLike | None) -> Diagnosis:
+    def _diagnosed_when(
+        self, log: RecordingBlocks, classes: ArrayLike | None, crosstalk: Crosstalk | None
+    ) -> Diagnosis:
         """Return the diagnosis of a log with the recordings in which faults show."""
-        whole = self._judged(log)
+        whole = self._judged(log, crosstalk)
         if self.reference_ is None or len(log) < 2:
             return whole
         held = self._held(log, self.reference_.tolerance, classes)
@@ -750,7 +792,7 @@ class SelfDiagnosis:
             held,
             [len(given) for given in log.given],
             self.reference_.tolerance,
-            lambda some: self._judged(RecordingBlocks([log.given[i] for i in some])),
+            lambda some: self._judged(RecordingBlocks([log.given[i] for i in some]), crosstalk),
         )
 
     def _held(self, log: RecordingBlocks, tolerance: float, classes: ArrayLike | None) -> Held:
@@ -803,6 +845,7 @@ class SelfDiagnosis:
             & ~intermittent
             & ~noisy
             & spatial.drifting
+            & (stream.crosstalk is None)
             & ~(life.floats & np.isfinite(spatial.factor))
         )
         # a group that fails as a whole explains what its cells do

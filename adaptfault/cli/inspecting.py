@@ -27,7 +27,6 @@ if TYPE_CHECKING:
     from adaptfault.inspection.severity import Reason
     from diagnostics import Diagnosis, SelfDiagnosis
 
-_TOLD_BY_THE_DIAGNOSIS = ("static_load", "frozen", "lost_frames")
 # of a map, which is followed by the summary if it has more: the first line has left the screen
 _ROWS = 24
 
@@ -169,12 +168,14 @@ def _reasons(
     tells itself."""
     from adaptfault.inspection.severity import Reason
 
+    told = {load.reason for load in diagnosis.static_loads}
+    told |= {one.reason for one in diagnosis.transport}
     reasons = [Reason(*_faults(diagnosis, bundle))]
     for finding in findings:
         if finding.name in ("fault", "wire"):
             continue
         severity = untested_code if finding.name == "untested" else finding.severity
-        text = "" if finding.name in _TOLD_BY_THE_DIAGNOSIS else finding.reason
+        text = "" if finding.reason in told else finding.reason
         if finding.name in ("rewired", "replaced_pad"):
             text += "; the verdicts are those with the readings put back"
         reasons.append(Reason(severity, text))

@@ -26,7 +26,7 @@ from diagnostics.sensor.disturbance import Disturbance, find_disturbances, find_
 from diagnostics.sensor.recalibration import Recalibration
 from diagnostics.sensor.rewiring import Rewiring
 from diagnostics.sensor.sensor_change import SensorChange
-from diagnostics.sensor.shared import Shared, measured
+from diagnostics.sensor.shared import measured
 from diagnostics.shown import shown
 
 SCHEMA = "adaptfault.inspection/1"
@@ -37,6 +37,7 @@ OF_FRAMES: Mapping[str, Name] = {
     "one_signal": "one_signal",
     "corrupt_frame": "corrupt_frame",
     "common_spike": "common_spike",
+    "crosstalk": "crosstalk",
 }
 """Names of the findings of each kind of transport fault."""
 
@@ -152,7 +153,7 @@ def inspect(
         ValueError: recordings that do not fit the layout, or hold no frame.
     """
     layout = diagnoser.layout
-    shared = Shared.of(checked_recordings(recordings, layout), layout)
+    shared = diagnoser.shared(recordings)
     given = list(RecordingBlocks(shared.recordings))
     log = [within_range(frames, layout)[0] for frames in given]
     healthy: list[NDArray[np.float64]] = []
@@ -172,10 +173,13 @@ def inspect(
         fitted = diagnoser.for_log(log, classes=classes, progress=progress)
         readings = ChangedReadings(None, None, log, fitted.diagnose(log, classes=classes))
     else:
-        told = any(one.name in _OF_ALL_CELLS for one in disturbances)
-        readings, common = _judged(log, healthy, diagnoser, disturbed=told)
+        told = shared.crosstalk is not None
+        told |= any(one.name in _OF_ALL_CELLS for one in disturbances)
+        # Crosstalk of lines is what the cells of a pad share, too.
+        compared = healthy if shared.crosstalk is None else []
+        readings, common = _judged(log, compared, diagnoser, disturbed=told)
         converter = None
-        if diagnoser.load_ is None:
+        if diagnoser.load_ is None and shared.crosstalk is None:
             converter = find_converter_change(log, healthy, layout, disturbances)
         if converter is not None:
             seen = converter.of(healthy)
@@ -185,7 +189,9 @@ def inspect(
                 (readings, common), diagnoser, healthy = others, behind, seen
     if common is not None:
         disturbances.append(common.disturbance)
-    change = _change(_with_offset(readings, common, log), healthy, diagnoser, disturbances)
+    change = None
+    if shared.crosstalk is None:
+        change = _change(_with_offset(readings, common, log), healthy, diagnoser, disturbances)
     if change is not None:  # measures it
         disturbances = [one for one in disturbances if one.name != "offset"]
     readings = replace(readings, diagnosis=shared.told(readings.diagnosis))

@@ -14,7 +14,7 @@ from adaptfault.inspection.inspection import OF_CELLS, Finding, Inspection, insp
 from diagnostics import Diagnosis, SelfDiagnosis
 from diagnostics.threads import one_thread
 
-_OF_PARTS = ("one_signal", "corrupt_frame", "common_spike")
+_OF_PARTS = ("one_signal", "corrupt_frame", "common_spike", "crosstalk")
 """Names of the findings that the diagnosis of the whole log no longer sees."""
 
 
@@ -54,6 +54,9 @@ def inspect_parts(
     inspected = []
     for part in chain([first, second], parts):
         one = inspect(part, fitted, reference=reference)
+        crosstalk = fitted.crosstalk(one.readings.frames)
+        if crosstalk is not None:
+            stream.crosstalk = crosstalk.joined(stream.crosstalk)
         with one_thread():
             for frames in one.readings.frames:
                 stream.extend(frames)

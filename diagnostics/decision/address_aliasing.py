@@ -31,6 +31,8 @@ def find_aliasing(stream: StreamState) -> tuple[list[Fault], NDArray[np.bool_]]:
     """Return the causes of all lines that read the same, and the cells that are or may be misread,
     bool ``[D]``."""
     pairs = stream.duplicates.duplicate_pairs(stream.reference.duplicates)
+    if stream.crosstalk is not None:  # lines that nothing touches read the same
+        pairs = []
     faults = list[Fault]()
     misread = np.zeros(stream.layout.n_cells, bool)
     for of in sorted({(pair.pad, pair.kind) for pair in pairs}):

@@ -230,7 +230,7 @@ class Diagnosis:
     @property
     def exit_code(self) -> int:
         """0: no fault. 1: single cells, a static load, or frames that were frozen, corrupt or
-        shifted. 2: a wire, or a tenth of the cells."""
+        shifted, or that show crosstalk. 2: a wire, or a tenth of the cells."""
         few = len(self.fault_set) < 0.1 * self.layout.present.sum()
         if not self.faults:
             frames = {fault.kind for fault in self.transport} - {"lost", "invalid"}

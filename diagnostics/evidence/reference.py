@@ -59,6 +59,8 @@ class Reference:
         noise: what all cells have; None: unknown.
         loads: float ``[n]``, load of each recording (:mod:`diagnostics.sensor.gain`); None:
             unknown.
+        floors: float ``[2, pads]``, share of the highest reading of its row or column that hardly
+            any cell reads less of (:mod:`diagnostics.sensor.crosstalk`); None: unknown.
     """
 
     tolerance: float
@@ -77,6 +79,7 @@ class Reference:
     life: LifeModel | None = None
     noise: UsualNoise | None = None
     loads: NDArray[np.float64] | None = None
+    floors: NDArray[np.float64] | None = None
 
     def repeats(self, layout: SensorLayout) -> Patience:
         """Return how often healthy frames repeat."""

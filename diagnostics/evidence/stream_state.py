@@ -57,6 +57,7 @@ if TYPE_CHECKING:
     from diagnostics.layout import SensorLayout
     from diagnostics.preprocessing.load import LoadDirection
     from diagnostics.preprocessing.scale import Array, Scale
+    from diagnostics.sensor.crosstalk import Crosstalk
 
 # with more events in a tile, all but the last are scored and dropped
 MAX_EVENTS = 40
@@ -97,6 +98,7 @@ class StreamState:
         scale: baseline with the present offsets, and full scale.
         below: bool ``[D]``, cells that last read less than at rest.
         life: the record for the proof of life; empty without a model of it.
+        crosstalk: of lines, that the reference does not have; None: not known.
     """
 
     def __init__(
@@ -140,6 +142,7 @@ class StreamState:
         self._response = WeakResponse.begin(layout.n_cells)
         self._level = RestLevel.begin(layout.n_cells)
         self.life = LifeRecord()
+        self.crosstalk: Crosstalk | None = None
         self._of_pad = PadLevel.begin(layout.n_cells)
         self._absent = not self.present.all()  # whether some position has no cell
         self._buffer = np.empty((SEGMENT, layout.n_cells))

@@ -31,7 +31,8 @@ class TransportFault:
     Attributes:
         kind: ``"lost"`` (frames without any reading), ``"frozen"`` (one frame repeated),
             ``"invalid"`` (readings that no converter gives), ``"corrupt_frame"``,
-            ``"common_spike"`` or ``"one_signal"`` (:mod:`diagnostics.sensor.shared`).
+            ``"common_spike"``, ``"one_signal"`` or ``"crosstalk"``
+            (:mod:`diagnostics.sensor.shared`).
         onset: number of the first such frame.
         frames: how many frames; of ``"invalid"``: how many readings.
         reason: one plain sentence.

@@ -1,7 +1,7 @@
 """What the array as a whole does in a log, found before any cell is judged.
 
 Frames that measured nothing are left out, and cells that all show one signal are told as that and
-take no part. The diagnosis of the cells then works on what is left.
+take no part. The diagnosis of the cells then works on what is left, knowing of crosstalk.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from diagnostics.faults import Fault, FaultKind
 from diagnostics.layout import SensorLayout
 from diagnostics.preprocessing.levels import RARE
 from diagnostics.preprocessing.transport import TransportFault
+from diagnostics.sensor.crosstalk import Crosstalk
 from diagnostics.sensor.odd_frames import OddFrame, evenly, find_odd_frames, without_odd_frames
 from diagnostics.sensor.one_signal import OneSignal, find_one_signal
 
@@ -39,12 +40,14 @@ class Shared:
         layout: the array.
         faults: how it is told.
         one_signal: the groups of cells that show one signal.
+        crosstalk: of lines; None: as in the reference.
     """
 
     recordings: list[NDArray[Any]]
     layout: SensorLayout
     faults: tuple[TransportFault, ...] = ()
     one_signal: tuple[OneSignal, ...] = ()
+    crosstalk: Crosstalk | None = None
 
     @classmethod
     def of(cls, log: RecordingBlocks, layout: SensorLayout) -> Shared:
@@ -61,6 +64,14 @@ class Shared:
         faults = _told(odd, begins, layout)
         faults += [TransportFault("one_signal", 0, int(begins[-1]), one.reason) for one in groups]
         return cls(recordings, layout, tuple(faults), groups)
+
+    def beside(self, crosstalk: Crosstalk | None) -> Shared:
+        """Return it with the crosstalk of its lines."""
+        if crosstalk is None:
+            return self
+        n_frames = sum(map(len, self.recordings))
+        told = TransportFault("crosstalk", 0, n_frames, crosstalk.reason)
+        return replace(self, crosstalk=crosstalk, faults=(*self.faults, told))
 
     @property
     def mask(self) -> NDArray[np.bool_]:
@@ -105,7 +116,7 @@ class Shared:
             possible=tuple(wire for wire in possible if wire is not None),
             probability=probability,
             tested=diagnosis.tested | mask,
-            transport=(*self.faults, *diagnosis.transport),
+            transport=tuple(dict.fromkeys((*self.faults, *diagnosis.transport))),
         )
 
 

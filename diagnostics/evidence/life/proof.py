@@ -121,6 +121,13 @@ class Life:
         alive."""
         return replace(cls.unknown(n_cells), shown=np.ones(n_cells, bool))
 
+    def undecided(self) -> Life:
+        """Return the evidence where a disturbance may be why cells depend on each other otherwise:
+        none is refuted."""
+        none = np.zeros_like(self.refuted)
+        evidence = np.minimum(self.evidence, 0.0)
+        return replace(self, evidence=evidence, refuted=none, certain=none, floats=none)
+
     @property
     def units(self) -> NDArray[np.intp]:
         """Number of units against each cell, int ``[D]``."""
@@ -287,14 +294,8 @@ def _concluded(
     contradict = int((refuted & alone).sum())
     tested = int(((shown | refuted) & alone).sum())
     contradicting = contradict / max(tested, 1)
-    if contradicting > _DISTURBED and contradict >= FEWEST:
-        evidence = np.minimum(evidence, 0.0)
-        refuted = np.zeros_like(refuted)
-        certain = np.zeros_like(certain)
-    else:
-        contradicting = 0.0
     first = log.begins[against.argmax(axis=0)]
-    return Life(
+    life = Life(
         evidence=evidence,
         kind=kind,
         shown=shown,
@@ -312,5 +313,8 @@ def _concluded(
         as_one=wires.as_one,
         floats=certain & (kind == 0),
         gain=np.full(len(evidence), np.nan),
-        contradicting=contradicting,
+        contradicting=0.0,
     )
+    if contradicting > _DISTURBED and contradict >= FEWEST:
+        return replace(life.undecided(), contradicting=contradicting)
+    return life

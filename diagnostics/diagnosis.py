@@ -836,6 +836,9 @@ class SelfDiagnosis:
         known = spatial.scored & ~runs.moved & (reference.dead > 0)
         odds = log_ratio(spatial.evidence, spatial.surprisal)
         stuck = self.calibrator_.probability(odds, kinds(stream), spatial.scored & ~known)
+        # At the level at which its pad rests nothing tells whether a cell is stuck.
+        at_rest = stream.rests_with_pad()
+        stuck[at_rest] = np.minimum(stuck[at_rest], DOUBTED)
         stuck[known] = reference.dead[known]
         delivers = present & ~explained & ~silent
         intermittent = intermittency.intermittent & delivers

@@ -14,6 +14,9 @@ other, and the second from the share of cells that are stuck elsewhere on the ar
 the highest sum are the object; its probability is the logistic function of the log odds. Cells of
 an object are neither faulty nor tested.
 
+No object holds a cell at full scale or below its rest, nor a pad where it rests with its cells
+(:mod:`diagnostics.preprocessing.offset`).
+
 Not detected: objects on fewer than three cells; objects of a shape or load that no contact of the
 reference had; objects without a reference. Cells that are stuck at values that an object could have
 look like one, unless they lost noise that they had in the reference.
@@ -119,8 +122,7 @@ def find_static_loads(
     held = _HeldLoads.of(stream, spatial, faulty, excluded)
     blamed = held.faulty & (held.root > 0)
     broken = _on_broken_wires(blamed & spatial.scored, stream)
-    # an object takes noise away at full scale only
-    broken |= stream.without_noise() & np.isfinite(held.values.high)
+    broken |= stream.without_noise()  # an object takes none away
     loaded = _mask([cell for load in known for cell in load.cells], len(faulty))
     holding = (held.root > 0) & ~broken
 
@@ -193,9 +195,12 @@ class _HeldLoads:
             0.0  # the load of the last contact, which may still go on
         )
         root[excluded | ~stream.present | (stream.reference.dead > 0) | (root**2 < SLIGHT)] = 0.0
+        level = stream.rest_of_pads()
+        root[(level > 0) & (root**2 * scale.full_scale <= level + scale.near)] = 0.0
         values = HeldValues.of(
             scale.baseline + root**2 * scale.full_scale, scale, stream.reference.tolerance
         )
+        root[np.isinf(values.high)] = 0.0  # full scale is no load of an object
         faulty = faulty & ~(np.isfinite(spatial.factor) & (spatial.since < since))
         return cls(stream, spatial, faulty, excluded, root, since, values)
 
@@ -215,14 +220,10 @@ class _HeldLoads:
         constant = self.spatial.scored
         present = self.stream.present
         anywhere = 4 * self.stream.reference.tolerance / self.stream.scale.full_scale
-        alternatives = (
-            (full, (1 - ANYWHERE) / 2, 1.0),
-            (constant & ~full, ANYWHERE, anywhere),
-            (~constant & ~full, ANYWHERE, anywhere),
-        )
-        stuck = np.empty(len(self.root))
-        for alike, share, width in alternatives:
-            stuck[alike] = max(EXPECTED * share, (blamed & alike).sum() / present.sum()) * width
+        stuck = np.ones(len(self.root))
+        for alike in (constant & ~full, ~constant & ~full):
+            share = max(EXPECTED * ANYWHERE, (blamed & alike).sum() / present.sum())
+            stuck[alike] = share * anywhere
         log_likely: Floats = np.logaddexp(np.log(stuck), -self.surprisal)
         return log_likely
 

@@ -23,7 +23,7 @@ from diagnostics.healthy.tiled_model import fit_healthy_model
 from diagnostics.preprocessing.baseline import baseline
 from diagnostics.preprocessing.levels import MARGIN
 from diagnostics.preprocessing.noise import UsualNoise
-from diagnostics.preprocessing.offset import ReferenceOffset, levelled, levels
+from diagnostics.preprocessing.offset import ReferenceOffset, highest_rests, levelled, levels
 from diagnostics.preprocessing.readings import SEGMENT, RecordingBlocks, spread
 from diagnostics.preprocessing.scale import Scale
 from diagnostics.preprocessing.transport import Patience
@@ -61,6 +61,8 @@ class Reference:
             unknown.
         floors: float ``[2, pads]``, share of the highest reading of its row or column that hardly
             any cell reads less of (:mod:`diagnostics.sensor.crosstalk`); None: unknown.
+        rests: float ``[pads]``, how far above their baselines the cells of each pad rest together,
+            as a supply that other pads load does not sag; None: unknown.
     """
 
     tolerance: float
@@ -80,6 +82,7 @@ class Reference:
     noise: UsualNoise | None = None
     loads: NDArray[np.float64] | None = None
     floors: NDArray[np.float64] | None = None
+    rests: NDArray[np.float64] | None = None
 
     def repeats(self, layout: SensorLayout) -> Patience:
         """Return how often healthy frames repeat."""
@@ -150,6 +153,7 @@ class Reference:
             patience.idle if level.any() else patience.loaded,
             PadLimit.fit(as_read, readings, layout, tolerance, float(np.ptp(level))),
             noise=UsualNoise.fit(recordings, present, converter_step(recordings, layout)),
+            rests=highest_rests(recordings, scale, layout),
         )
 
     def with_life(

@@ -46,7 +46,7 @@ from diagnostics.healthy.nearest_neighbours import NearestNeighbours
 from diagnostics.healthy.prediction import OUTLIERS
 from diagnostics.preprocessing.levels import LIGHT, MAJORITY, SUSPICIOUS
 from diagnostics.preprocessing.noise import NoiseNow
-from diagnostics.preprocessing.offset import OffsetTracker
+from diagnostics.preprocessing.offset import OffsetTracker, even_rests
 from diagnostics.preprocessing.readings import SEGMENT, held
 from diagnostics.preprocessing.rest_of_log import RestOfLog
 from diagnostics.preprocessing.transport import TransportState, invalid
@@ -240,6 +240,32 @@ class StreamState:
         return np.isfinite(self.runs.value) & (
             self.scale.root_load(self.runs.value) <= self.scale.root_near
         )
+
+    def rest_of_pads(self) -> NDArray[np.float64]:
+        """Return how far above their baselines half of the cells of each cell's pad read together,
+        ``[D]``: now, or as the least since they were last unloaded.
+
+        0 where none do, or where it is more than in the reference.
+        """
+        usual = self.reference.rests
+        if usual is None:
+            return np.zeros(self.layout.n_cells)
+        near = self.scale.near
+        pad_of = self.layout.pad_of
+        now = self.runs.last - self.scale.baseline
+        least = self.least_loads()[0] ** 2 * self.scale.full_scale
+        rests = np.zeros(self.layout.pads)
+        for above in (least, now):
+            even = even_rests(np.where(self.present, above, np.nan), pad_of, len(rests), near)
+            rests = np.where((even > near) & (even <= usual + near), even, rests)
+        return rests[pad_of]
+
+    def rests_with_pad(self) -> Mask:
+        """Return the cells that hold what their pad rests at, above their baselines, bool
+        ``[D]``."""
+        level = self.rest_of_pads()
+        above = self.runs.value - self.scale.baseline
+        return np.asarray((level > 0) & (np.abs(above - level) <= self.scale.near))
 
     def unused(self, alive: Mask) -> Mask:
         """Return the cells at rest of pads that nothing shows to be in use, bool ``[D]``.

@@ -23,6 +23,10 @@ recording r is::
 and counts if the q05 over cells, in place of q25, exceeds 5 % in half of the recordings: no contact
 loads nearly all cells throughout most recordings. Levels within a recording of the reference are
 not recognised.
+
+The supply of a pad may sag while others are loaded. Its baseline is then the lower level, and at
+the higher one all its cells seem loaded alike. The even rest of a pad is the middle of the shortest
+interval that holds half of its cells, if that is narrow.
 """
 
 from __future__ import annotations
@@ -34,12 +38,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from diagnostics.preprocessing.levels import LEAST_LOADED, LIGHT, LOW, MAJORITY, SLIGHT
+from diagnostics.preprocessing.levels import FEWEST, LEAST_LOADED, LIGHT, LOW, MAJORITY, SLIGHT
 from diagnostics.preprocessing.quantiles import known_quantile
 from diagnostics.preprocessing.readings import RecordingBlocks, spread
 from diagnostics.preprocessing.scale import usual_limit
 
 if TYPE_CHECKING:
+    from diagnostics.layout import SensorLayout
     from diagnostics.preprocessing.scale import Scale
 
 Floats = NDArray[np.float64]
@@ -206,6 +211,39 @@ def levels_above(
     above = _lows(readings, range(len(readings)), cells) - scale.baseline[cells]
     level = usual.excess([least_loaded(of_recording) for of_recording in above])
     return np.where(level < usual.limit(scale.full_scale), level, 0.0)
+
+
+def even_rests(above: Floats, pad_of: NDArray[np.intp], pads: int, near: float) -> Floats:
+    """Return what half of the cells of each pad read within ``near`` of each other, ``[pads]``; NaN
+    where no half does.
+
+    Args:
+        above: ``[D]``, reading of each cell above its baseline; NaN: none, or no cell.
+        pad_of: int ``[D]``, pad of each cell.
+        pads: their number.
+        near: readings that differ by less agree.
+    """
+    found = np.full(pads, np.nan)
+    for pad in range(pads):
+        ordered = np.sort(above[(pad_of == pad) & np.isfinite(above)])
+        half = len(ordered) // 2
+        if half < FEWEST:
+            continue
+        width = ordered[half:] - ordered[: len(ordered) - half]
+        first = int(width.argmin())
+        if width[first] <= near:
+            found[pad] = np.median(ordered[first : first + half + 1])
+    return found
+
+
+def highest_rests(recordings: Sequence[Floats], scale: Scale, layout: SensorLayout) -> Floats:
+    """Return the highest even rest of each pad in recordings ``[T, D]``, ``[pads]``; 0 without
+    any."""
+    present = layout.present.ravel()
+    frames = RecordingBlocks.of(recordings).thinned(np.arange(layout.n_cells))
+    above = np.where(present, frames - scale.baseline, np.nan)
+    rests = np.array([even_rests(one, layout.pad_of, layout.pads, scale.near) for one in above])
+    return np.asarray(np.nan_to_num(known_quantile(rests, 1 - LOW, axis=0)))
 
 
 def _lows(readings: RecordingBlocks, which: range, cells: NDArray[np.intp]) -> Floats:

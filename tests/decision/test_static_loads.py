@@ -2,6 +2,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import pytest
+from conftest import without_calibration
 
 from adaptfault.data.recordings import Recordings
 from diagnostics import (
@@ -103,6 +104,56 @@ def test_stuck_cells_beside_an_object_are_found(fitted, log, object_):
     found = fitted.diagnose([inject(r, faults, LAYOUT) for r in lying(log, object_)])
     assert set(found.fault_set) == set(cells)
     assert found.static_loads
+
+
+def test_a_cell_at_full_scale_is_no_part_of_an_object(fitted, log, object_):
+    short = int(np.flatnonzero(object_)[4])
+    found = fitted.diagnose(
+        [inject(r, [Fault("short", (short,))], LAYOUT) for r in lying(log, object_)]
+    )
+    assert set(found.fault_set) == {short}
+    assert all(short not in load.cells for load in found.static_loads)
+
+
+PADS = SensorLayout(2, 6, 4, full_scale=512.0, unit="count", rate=25.0)
+
+
+def sagging(seed: int, recordings: int, idle: int = 0) -> list[np.ndarray]:
+    """Return presses on two pads that rest at 140 counts, and in most recordings 25 lower: their
+    supply sags. In the last ``idle`` ones it does not, and nothing touches the first pad."""
+    rng = np.random.default_rng(seed)
+    places = np.argwhere(np.ones((6, 4)))
+    time = np.arange(60)[:, None] * np.pi / 60
+    log = []
+    for k in range(recordings):
+        last = k >= recordings - idle
+        loads = np.zeros((60, 2, 24))
+        for pad in range(last, 2):
+            apart = ((places - rng.uniform(0, (5, 3))) ** 2).sum(axis=1)
+            press = np.exp(-apart / (2 * rng.uniform(0.8, 1.4) ** 2))
+            loads[:, pad] = rng.uniform(100, 300) * np.clip(np.sin(time * (1 + 2 * last)), 0, None)
+            loads[:, pad] *= press
+        rest = 140 - 25 * (rng.random() < 0.7 and not last)
+        noise = rng.normal(0, 0.7, (60, 48))
+        log.append(np.clip(np.rint(rest + loads.reshape(60, 48) + noise), 0, 512))
+    return log
+
+
+@pytest.fixture(scope="module")
+def of_pads() -> SelfDiagnosis:
+    with without_calibration():
+        return SelfDiagnosis(PADS).fit(sagging(1, 40))
+
+
+@pytest.mark.parametrize("seed", range(2, 8))
+def test_a_pad_whose_supply_sags_is_no_object_nor_stuck_and_its_shorts_are_found(of_pads, seed):
+    log = sagging(seed, 12, idle=4)
+    for frames in log:
+        frames[:, [3, 9]] = 512
+    found = of_pads.diagnose(log)
+    assert {3, 9} <= set(found.fault_set)
+    assert not found.static_loads
+    assert FaultKind.STUCK not in {fault.kind for fault in found.faults}
 
 
 def test_a_wire_that_holds_a_value_is_no_object(fitted, log):

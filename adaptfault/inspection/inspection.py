@@ -17,15 +17,16 @@ from adaptfault.inspection.changed_readings import (
 )
 from adaptfault.inspection.converter_range import within_range
 from adaptfault.inspection.severity import Name, of_faults, of_finding, untested, worst
-from diagnostics import Diagnosis, SelfDiagnosis, SensorLayout
+from diagnostics import Diagnosis, FaultSet, SelfDiagnosis, SensorLayout
 from diagnostics.diagnosis import checked_recordings
+from diagnostics.evidence.drift import GAIN
 from diagnostics.preprocessing.readings import RecordingBlocks
 from diagnostics.sensor.common_mode import CommonMode, find_common_mode
 from diagnostics.sensor.converter_change import find_converter_change
 from diagnostics.sensor.disturbance import Disturbance, find_disturbances, find_sentinel
 from diagnostics.sensor.recalibration import Recalibration
 from diagnostics.sensor.rewiring import Rewiring
-from diagnostics.sensor.sensor_change import SensorChange
+from diagnostics.sensor.sensor_change import SensorChange, amplification
 from diagnostics.sensor.shared import measured
 from diagnostics.shown import shown
 
@@ -169,6 +170,7 @@ def inspect(
         findings = [_finding(one) for one in disturbances]
         return Inspection(ChangedReadings(None, None, log, _untold(log, layout)), tuple(findings))
     common = None
+    amplified = 1.0
     if diagnoser.reference_ is None:
         fitted = diagnoser.for_log(log, classes=classes, progress=progress)
         readings = ChangedReadings(None, None, log, fitted.diagnose(log, classes=classes))
@@ -178,19 +180,25 @@ def inspect(
         # Crosstalk of lines is what the cells of a pad share, too.
         compared = healthy if shared.crosstalk is None else []
         readings, common = _judged(log, compared, diagnoser, disturbed=told)
+        others = _without_groups(log, readings.diagnosis)
+        if others is not None:  # what a bus does is no disturbance of all
+            disturbances = _disturbances(given, others, healthy, layout)
         converter = None
         if diagnoser.load_ is None and shared.crosstalk is None:
             converter = find_converter_change(log, healthy, layout, disturbances)
         if converter is not None:
             seen = converter.of(healthy)
             behind = SelfDiagnosis(**diagnoser.get_params()).fit(seen, progress=progress)
-            others = _judged(log, seen, behind, disturbed=told)
-            if len(others[0].diagnosis.fault_set) <= len(readings.diagnosis.fault_set):
-                (readings, common), diagnoser, healthy = others, behind, seen
+            again = _judged(log, seen, behind, disturbed=told)
+            if len(again[0].diagnosis.fault_set) <= len(readings.diagnosis.fault_set):
+                (readings, common), diagnoser, healthy = again, behind, seen
+                amplified = converter.gain
     if common is not None:
         disturbances.append(common.disturbance)
     change = None
-    if shared.crosstalk is None:
+    if max(amplified, 1 / amplified) >= GAIN:
+        change = amplification(amplified, len(log))
+    elif shared.crosstalk is None:
         change = _change(_with_offset(readings, common, log), healthy, diagnoser, disturbances)
     if change is not None:  # measures it
         disturbances = [one for one in disturbances if one.name != "offset"]
@@ -222,6 +230,17 @@ def _disturbances(
     ]
 
 
+def _without_groups(
+    log: list[NDArray[np.float64]], diagnosis: Diagnosis
+) -> list[NDArray[np.float64]] | None:
+    """Return a log without the readings of wires that are faulty as a whole; None without any."""
+    cells = [cell for fault in diagnosis.faults if fault.line is not None for cell in fault.cells]
+    if not cells:
+        return None
+    faulty = FaultSet(tuple(cells), diagnosis.layout.n_cells).mask
+    return [np.where(faulty, np.nan, frames) for frames in log]
+
+
 def _judged(
     log: list[NDArray[np.float64]],
     healthy: list[NDArray[np.float64]],
@@ -246,19 +265,18 @@ def _judged(
     undone = common.undo(log, diagnoser.layout)
     without = find_changed_readings(diagnoser, undone, healthy, disturbed=True)
     explanations = len(without.diagnosis.faults) + 1
-    if explanations > len(as_it_is.diagnosis.faults) and _is_converter(as_it_is.diagnosis):
+    if explanations > len(as_it_is.diagnosis.faults) and _is_group(as_it_is.diagnosis):
         return as_it_is, None
     if without.diagnosis.n_lost > as_it_is.diagnosis.n_lost:
         return as_it_is, None
     return without, common
 
 
-def _is_converter(diagnosis: Diagnosis) -> bool:
-    """Return whether a converter is among the faults: its cells share what they read, as those of a
-    common mode."""
-    return any(
-        fault.line is not None and fault.line.kind == "converter" for fault in diagnosis.faults
-    )
+def _is_group(diagnosis: Diagnosis) -> bool:
+    """Return whether a bus or a converter is among the faults: its cells share what they read, as
+    those of a common mode."""
+    kinds = {fault.line.kind for fault in diagnosis.faults if fault.line is not None}
+    return not kinds.isdisjoint(("converter", "bus", "group", "position"))
 
 
 def _with_offset(

@@ -91,6 +91,19 @@ def test_any_finger_that_blinks_from_some_recording_on_is_one_cause(fitted, fing
     assert fault.onset == pytest.approx(18 * FRAMES + FAILS, abs=2)
 
 
+@pytest.mark.parametrize("way", ["blinks", "high"])
+def test_a_finger_that_fails_in_all_recordings_is_told_once_and_nothing_of_the_whole_sensor(
+    fitted, way: str
+):
+    rng = np.random.default_rng(3)
+    log = recordings(30, 2)
+    for frames in log:
+        frames[FAILS:45, 12:18] = failing(way, frames[FAILS:45, 12:18], rng)
+    found = inspect(log, fitted, reference=recordings(60, 1))
+    assert [one.name for one in found.findings] == ["wire"]
+    assert set(found.diagnosis.fault_set) == set(range(12, 18))
+
+
 def test_a_finger_that_a_flat_object_presses_beyond_the_range_is_healthy(fitted):
     log = recordings(30, 2)
     rise = np.minimum(1, np.arange(FRAMES) / 20) * np.minimum(1, np.arange(FRAMES)[::-1] / 20)

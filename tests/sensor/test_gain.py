@@ -54,6 +54,15 @@ def test_an_array_with_another_gain_is_told_and_diagnosis_and_inspection_blame_n
     assert not fitted.diagnose(log).fault_set
 
 
+def test_a_gain_with_which_the_amplifier_saturates_is_told_with_both(fitted, reference):
+    log = [np.minimum(frames, 500) for frames in grasps(2, 20, 3.0)]
+    with without_calibration():
+        found = af.inspect(log, fitted, reference=reference)
+    assert {"gain", "saturated"} <= {finding.name for finding in found.findings}
+    assert found.change.gain == pytest.approx(3, rel=0.3)
+    assert not found.diagnosis.fault_set
+
+
 def test_a_dead_cell_is_found_beside_another_gain(fitted, reference):
     log = [
         inject(r, [Fault("short", (5,)), Fault("open", (10,))], LAYOUT) for r in grasps(2, 20, 2)

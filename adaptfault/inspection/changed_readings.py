@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from diagnostics import Diagnosis, FaultKind, FaultSet, SelfDiagnosis
-from diagnostics.preprocessing.levels import LEAST_LOADED
+from diagnostics.preprocessing.levels import EXPECTED, LEAST_LOADED
+from diagnostics.sensor.another_sensor import AnotherSensor, find_another_sensor
 from diagnostics.sensor.recalibration import Recalibration, find_recalibration, recalibrated
 from diagnostics.sensor.rewiring import Rewiring
 from diagnostics.sensor.sensor_change import SensorChange, find_change
@@ -18,6 +19,15 @@ from diagnostics.sensor.swapped_in_part import SwappedInPart, newest_contradict
 
 if TYPE_CHECKING:
     from adaptfault.bundle.versions import Version
+
+_OF_ANY_SENSOR = (
+    FaultKind.OPEN,
+    FaultKind.SHORT,
+    FaultKind.STUCK,
+    FaultKind.INTERMITTENT,
+    FaultKind.ALIAS,
+    FaultKind.COPY,
+)
 
 Frames = list[NDArray[np.float64]]
 
@@ -37,6 +47,7 @@ class ChangedReadings:
         as_found: the recordings as they came and their diagnosis, where a pad was replaced; None
             otherwise.
         in_part: wires that were exchanged in some of the recordings: no version undoes that.
+        another: recordings of another sensor; some of them are left out of ``frames``.
     """
 
     rewiring: Rewiring | None
@@ -45,6 +56,7 @@ class ChangedReadings:
     diagnosis: Diagnosis
     as_found: ChangedReadings | None = None
     in_part: SwappedInPart | None = None
+    another: AnotherSensor | None = None
 
     @property
     def reason(self) -> str:
@@ -126,6 +138,7 @@ def find_changed_readings(
     healthy: Sequence[NDArray[Any]],
     *,
     disturbed: bool = False,
+    comparable: bool = True,
 ) -> ChangedReadings:
     """Return what changed between cells and readings, and the diagnosis with it undone.
 
@@ -136,15 +149,73 @@ def find_changed_readings(
         disturbed: a disturbance of the array may explain what differs: then no pad counts as
             replaced, and wires as exchanged only where fewer cells are faulty once they are put
             back.
+        comparable: readings are neither cut off nor rounded otherwise than the reference: they tell
+            one sensor from another.
     """
     exchanged = _put_back(diagnoser, frames)
     as_found = ChangedReadings(None, None, frames, diagnoser.diagnose(frames))
+    another = None
+    if exchanged is None and comparable:
+        another = _another(diagnoser, as_found, healthy)
+    if another is not None and not another.is_whole:
+        left = another.left_out(frames)
+        return ChangedReadings(None, None, left, _left(diagnoser.diagnose(left)), another=another)
     if disturbed and (exchanged is None or exchanged.diagnosis.n_lost >= as_found.diagnosis.n_lost):
-        return as_found
+        return as_found if another is None else _as_another(as_found, another)
     replaced = _with_new_gains(diagnoser, as_found, healthy, exchanged)
-    if replaced is None:
-        return exchanged or as_found
-    return as_found if disturbed else replaced
+    if replaced is not None:
+        return as_found if disturbed else replaced
+    if another is not None:
+        return _as_another(as_found, another)
+    return exchanged or as_found
+
+
+def _as_another(as_found: ChangedReadings, another: AnotherSensor) -> ChangedReadings:
+    """Return a log of another sensor."""
+    diagnosis = _of_any_sensor(as_found.diagnosis, another.pads)
+    return replace(as_found, diagnosis=diagnosis, another=another)
+
+
+def _another(
+    diagnoser: SelfDiagnosis, as_found: ChangedReadings, healthy: Sequence[NDArray[Any]]
+) -> AnotherSensor | None:
+    """Return which recordings come from another sensor than the reference; None: none, or nothing
+    tells."""
+    load = diagnoser.load_
+    unknown = diagnoser.layout.axes > 1 or (load is not None and load.direction == "middle")
+    if diagnoser.reference_ is None or unknown:
+        return None
+    diagnosis = as_found.diagnosis
+    frames = diagnoser.without_gain(as_found.frames) or as_found.frames
+    return find_another_sensor(
+        as_loads(diagnoser, list(frames)),
+        as_loads(diagnoser, healthy),
+        diagnoser.reference_,
+        diagnoser.layout,
+        _faulty(diagnosis) | diagnosis.disturbed.mask,
+    )
+
+
+def _left(diagnosis: Diagnosis) -> Diagnosis:
+    """Return the diagnosis of a log of which recordings are left out: these are not lost."""
+    transport = tuple(one for one in diagnosis.transport if one.kind != "lost")
+    return replace(diagnosis, transport=transport)
+
+
+def _of_any_sensor(diagnosis: Diagnosis, pads: Sequence[int]) -> Diagnosis:
+    """Return a diagnosis of pads that are not those of the reference: it tells which of their cells
+    hold a value or repeat another, not how much they should read."""
+    on = np.isin(diagnosis.layout.pad_of, pads)
+    holds = [fault for fault in diagnosis.faults if fault.kind in _OF_ANY_SENSOR]
+    faults = [fault for fault in diagnosis.faults if fault in holds or not on[[*fault.cells]].all()]
+    untold = diagnosis.fault_set.mask.copy()
+    untold[[cell for fault in faults for cell in fault.cells]] = False
+    return replace(
+        diagnosis,
+        faults=tuple(faults),
+        tested=diagnosis.tested & ~untold,
+        probability=np.where(untold, EXPECTED, diagnosis.probability),
+    )
 
 
 def _with_new_gains(
@@ -161,7 +232,8 @@ def _with_new_gains(
         return None
     full_scale = diagnoser.layout.full_scale
     undone = [recalibration.undo(recording, full_scale) for recording in as_found.frames]
-    return ChangedReadings(None, recalibration, undone, diagnoser.diagnose(undone), as_found)
+    diagnosis = _of_any_sensor(diagnoser.diagnose(undone), recalibration.pads)
+    return ChangedReadings(None, recalibration, undone, diagnosis, as_found)
 
 
 def _found_again(diagnoser: SelfDiagnosis, frames: Frames, rewiring: Rewiring) -> bool:
@@ -224,8 +296,22 @@ def _recalibration(
     diagnosis = as_found.diagnosis
     if diagnoser.load_ is not None or diagnoser.reference_ is None or not healthy:
         return None
-    # Many cells of a new pad have other gains and offsets. Other faulty cells tell nothing of it.
-    layout = diagnoser.layout
+    held = diagnosis.statically_loaded.mask
+    return find_recalibration(
+        as_found.frames,
+        healthy,
+        diagnoser.reference_,
+        diagnoser.layout,
+        _faulty(diagnosis),
+        held,
+        rival=rival,
+    )
+
+
+def _faulty(diagnosis: Diagnosis) -> NDArray[np.bool_]:
+    """Return the faulty cells that tell nothing of a new pad, bool ``[D]``: many cells of one have
+    other gains and offsets."""
+    layout = diagnosis.layout
     faulty = diagnosis.fault_set.mask.copy()
     otherwise = np.zeros(layout.n_cells, bool)
     for fault in diagnosis.faults:
@@ -234,13 +320,4 @@ def _recalibration(
         on = layout.present.ravel() & (layout.pad_of == pad)
         if (on & otherwise).sum() > LEAST_LOADED * on.sum():
             faulty[on & otherwise] = False
-    held = diagnosis.statically_loaded.mask
-    return find_recalibration(
-        as_found.frames,
-        healthy,
-        diagnoser.reference_,
-        layout,
-        faulty,
-        held,
-        rival=rival,
-    )
+    return faulty

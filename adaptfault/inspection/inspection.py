@@ -45,7 +45,7 @@ OF_FRAMES: Mapping[str, Name] = {
 OF_CELLS = ("fault", "wire", "static_load", *OF_FRAMES.values(), "untested")
 """Names of the findings that a diagnosis gives."""
 
-_OF_ALL_CELLS = ("noise", "quantised", "saturated", "normalised")
+_OF_ALL_CELLS = ("quantised", "saturated", "normalised")
 
 _EXPLAIN_A_CHANGE = ("normalised", "ramp", "hum", "crosstalk")
 
@@ -255,15 +255,22 @@ def _judged(
     disturbances are known.
     """
     common = find_common_mode(log, healthy, diagnoser.layout) if healthy else None
-    disturbed = disturbed or common is not None
-    as_it_is = find_changed_readings(diagnoser, log, healthy, disturbed=disturbed)
+    as_it_is = find_changed_readings(
+        diagnoser,
+        log,
+        healthy,
+        disturbed=disturbed or common is not None,
+        comparable=not disturbed,
+    )
     if common is None:
         return as_it_is, None
     # Where all cells read more, so does what they share of a contact.
     if not as_it_is.diagnosis.faults and diagnoser.without_gain(log) is not None:
         return as_it_is, None
     undone = common.undo(log, diagnoser.layout)
-    without = find_changed_readings(diagnoser, undone, healthy, disturbed=True)
+    without = find_changed_readings(
+        diagnoser, undone, healthy, disturbed=True, comparable=not disturbed
+    )
     explanations = len(without.diagnosis.faults) + 1
     if explanations > len(as_it_is.diagnosis.faults) and _is_group(as_it_is.diagnosis):
         return as_it_is, None
@@ -302,6 +309,8 @@ def _change(
 
 def _of_readings(readings: ChangedReadings) -> list[Finding]:
     """Return exchanged wires, or replaced pads."""
+    if readings.another is not None:
+        return [_told("another_sensor", readings.another.reason)]
     if readings.in_part is not None:
         return [_told("swapped_in_part", readings.in_part.reason)]
     if readings.rewiring is not None:

@@ -38,6 +38,7 @@ Name = Literal[
     "corrupt_frame",
     "common_spike",
     "swapped_in_part",
+    "another_sensor",
 ]
 NAMES: tuple[str, ...] = get_args(Name)
 """Names of findings; they never change, because programs ask for them."""
@@ -56,6 +57,7 @@ UNTESTED = 0.05
 _OF_FINDING: Mapping[Name, int] = {
     "rewired": 2,
     "swapped_in_part": 2,
+    "another_sensor": 2,
     "one_signal": 2,
     "normalised": 2,
     "silent_array": 2,

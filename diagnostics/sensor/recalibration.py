@@ -5,9 +5,10 @@ A new specimen of a pad has other gains and offsets. The reading of cell i is mo
 
     reading = g_i usual reading + o_i
 
-o_i follows from the least readings. log g_i is the mean of 2 log(y_e / m_e) over the events e that
-load the cell, for its root load y_e and the mean m_e that the healthy model expects from the other
-cells; the readings are corrected and the means computed again, until they agree (Gauss-Seidel).
+o_i follows from low quantiles, without noise that came. log g_i is the mean of 2 log(y_e / m_e)
+over the events e that load the cell, for its root load y_e and the mean m_e that the healthy model
+expects from the other cells; the readings are corrected and the means computed again, until they
+agree (Gauss-Seidel).
 Cells of one pad share a normal prior of log g, with mean and variance estimated from them
 (random-effects model, DerSimonian and Laird 1986), so that cells with few events take the gain of
 their pad. A pad was replaced where its cells differ from each other: either half of the recordings
@@ -31,11 +32,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import ndtri
+from scipy.stats import chi2
 
 from diagnostics.evidence.drift import FEWEST_EVENTS, GAIN
 from diagnostics.healthy.model import contact_events
 from diagnostics.healthy.prediction import OUTLIERS, log_student_t
-from diagnostics.preprocessing.levels import LOW, MARGIN, SLIGHT
+from diagnostics.preprocessing.levels import FEWEST, LOW, MARGIN, SLIGHT
 from diagnostics.preprocessing.readings import held
 
 if TYPE_CHECKING:
@@ -51,6 +54,7 @@ _ROUNDS = 4
 _STEP = 0.6
 _LEAST_VARIANCE = 0.02  # of 2 log(y / m) in one event: events of a log are similar
 _MEDIAN_DEVIATION = 0.6745  # of a normal distribution, in standard deviations
+_FARTHEST = 1.5  # 2 log(y / m) of one event counts no more
 _WIDE = 1.5  # standardised errors beyond this count less (Huber 1964)
 
 Floats = NDArray[np.float64]
@@ -127,11 +131,13 @@ def find_recalibration(
         rival: the recordings with wires put back, which must not explain the log better.
     """
     used = layout.present.ravel() & ~excluded & (reference.dead == 0)
-    new = [filled for r in recordings if (filled := _filled(r, reference)) is not None]
-    old = [filled for r in healthy if (filled := _filled(r, reference)) is not None]
+    new = [filled for r in recordings if (filled := complete(r, reference)) is not None]
+    old = [filled for r in healthy if (filled := complete(r, reference)) is not None]
     if reference.model is None or len(new) < _FEWEST or len(old) < _FEWEST:
         return None
-    fit = _Fit(reference, layout, used, np.quantile(np.concatenate(old), LOW, axis=0))
+    usual = noise_of(old)
+    least = np.quantile(np.concatenate(old), LOW, axis=0)
+    fit = Fit(reference, layout, used, least, usual)
     halves = new[::2], new[1::2]
     of_halves = [fit.learned(half) for half in halves]
     differing = [on for on in fit.pads if fit.differ(on & used, *of_halves)]
@@ -165,13 +171,10 @@ def find_recalibration(
     moved = np.zeros_like(offset)
     for i in certain:
         on = differing[i]
-        correlation, errors = _correlation(offset, clear[i], layout)
-        # A strap or an object loads neighbouring cells alike; what lies on few pairs of cells is
-        # not told from it.
-        hidden = correlation > _ERRORS * errors or (
-            statically_loaded[on].any() and not np.isfinite(errors)
-        )
-        if not hidden:
+        _, errors = _correlation(offset, clear[i], layout)
+        # what lies on few pairs of cells is not told from a strap
+        hidden = statically_loaded[on].any() and not np.isfinite(errors)
+        if not hidden and not neighbours_agree(offset, clear[i], layout):
             replaced.append(int(layout.pad_of[on][0]))
             throughout &= _throughout(gained[best[i], i])
             gain[on] = np.exp(log_gain[on]) if best[i] == 0 else 1.0
@@ -179,6 +182,13 @@ def find_recalibration(
     if not replaced:
         return None
     return Recalibration(gain, moved, tuple(replaced), len(new), throughout)
+
+
+def neighbours_agree(offset: Floats, on: Mask, layout: SensorLayout) -> bool:
+    """Return whether neighbouring cells of a pad (bool ``[D]``) have alike offsets (``[D]``): a
+    strap or an object loads them so."""
+    correlation, errors = _correlation(offset, on, layout)
+    return bool(correlation > _ERRORS * errors)
 
 
 def _correlation(offset: Floats, on: Mask, layout: SensorLayout) -> tuple[float, float]:
@@ -195,7 +205,7 @@ def _correlation(offset: Floats, on: Mask, layout: SensorLayout) -> tuple[float,
     return float(np.corrcoef(a, b)[0, 1]), 1 / np.sqrt(len(a))
 
 
-def _common_spread(one: Floats, other: Floats, on: Mask) -> float:
+def common_spread(one: Floats, other: Floats, on: Mask) -> float:
     """Return the standard deviation over some cells of what two estimates (``[D]``) have in common.
 
     The root of the comedian (Falk 1997), a median of products: a few faulty cells differ from the
@@ -221,7 +231,7 @@ def _throughout(gained: Floats) -> bool:
 
 
 @dataclass(frozen=True)
-class _Fit:
+class Fit:
     """Gains and offsets of a sensor against its reference.
 
     Attributes:
@@ -229,12 +239,14 @@ class _Fit:
         layout: the array.
         used: bool ``[D]``, cells that serve as predictors.
         least: float ``[D]``, low quantile of the readings of the reference.
+        noise: float ``[D]``, its noise.
     """
 
     reference: Reference
     layout: SensorLayout
     used: Mask
     least: Floats
+    noise: Floats
 
     @property
     def pads(self) -> list[Mask]:
@@ -248,8 +260,8 @@ class _Fit:
 
         What is learned is shrunk: half of what matters is enough.
         """
-        by_gain = _common_spread(one[0], other[0], on)
-        by_offset = _common_spread(one[1], other[1], on)
+        by_gain = common_spread(one[0], other[0], on)
+        by_offset = common_spread(one[1], other[1], on)
         slight = SLIGHT * self.reference.scale.full_scale
         return bool(by_gain >= np.log(GAIN) / 2 or by_offset >= slight / 2)
 
@@ -270,14 +282,14 @@ class _Fit:
         ours = 0.0
         for (log_gain, offset), other in zip(of_halves, halves[::-1], strict=True):
             ours += everywhere.scores(other, log_gain * on, offset * on).sum()
-        put_back = [one for r in rival if (one := _filled(r, self.reference)) is not None]
+        put_back = [one for r in rival if (one := complete(r, self.reference)) is not None]
         nothing = np.zeros(self.layout.n_cells)
         return bool(everywhere.scores(put_back, nothing, nothing).sum() > ours)
 
     def learned(self, recordings: Sequence[Floats]) -> Learned:
         """Return log gain and offset of each cell, ``[D]``; the offset in the layout's unit, of the
         baseline."""
-        offset = np.quantile(np.concatenate(recordings), LOW, axis=0) - self.least
+        offset = self.rest(recordings) - self.least
         log_gain = np.zeros(len(offset))
         for _ in range(_ROUNDS):
             features, _ = self._events(recordings, log_gain, offset)
@@ -290,6 +302,13 @@ class _Fit:
                     _shrunk((log_gain + ratio)[on], variance[on]) - log_gain[on]
                 )
         return log_gain, offset
+
+    def rest(self, recordings: Sequence[Floats]) -> Floats:
+        """Return a low quantile of each cell, ``[D]``, less how far noise lowers it that most cells
+        have, beyond that of another gain."""
+        low: Floats = np.quantile(np.concatenate(recordings), LOW, axis=0)
+        came = np.maximum(noise_of(recordings) - 2 * self.noise, 0.0)
+        return low - ndtri(LOW) * came if np.median(came[self.used]) > 0 else low
 
     def scores(self, recordings: Sequence[Floats], log_gain: Floats, offset: Floats) -> Floats:
         """Return the log pseudo-likelihood of each recording, with the readings corrected."""
@@ -334,18 +353,37 @@ class _Fit:
         features, of = zip(*found, strict=True)
         return np.stack(features), np.array(of)
 
-    def _ratios(self, features: Array, expected: Prediction) -> tuple[Floats, Floats]:
-        """Return the mean of 2 log(y / m) of each cell, and its variance, ``[D]``; NaN: too few
-        events."""
+    def by_recording(self, recordings: Sequence[Floats]) -> tuple[Floats, Floats]:
+        """Return the mean of 2 log(y / m) of each cell in each recording, and its precision,
+        ``[n, D]`` each; 0 and 0 where nothing tells it."""
+        nothing = np.zeros(self.layout.n_cells)
+        total = np.zeros((len(recordings), self.layout.n_cells))
+        precision = np.zeros_like(total)
+        features, of = self._events(recordings, nothing, nothing)
+        if not len(features):
+            return total, precision
+        ratio, error = self._each_ratio(features, self._predicted(features))
+        weight = 1 / (error**2 + _LEAST_VARIANCE)
+        np.add.at(total, of, weight * np.clip(ratio, -_FARTHEST, _FARTHEST))
+        np.add.at(precision, of, weight)
+        return total / np.maximum(precision, np.finfo(float).tiny), precision
+
+    def _each_ratio(self, features: Array, expected: Prediction) -> tuple[Floats, Floats]:
+        """Return 2 log(y / m) of each event and its standard error, ``[n, D]`` each; 0 and inf
+        where the cell, or what is expected of it, is hardly loaded."""
         load = features[:, 1].astype(np.float64)
         spread = np.nan_to_num(expected.spread, nan=np.inf)
         shown = (features[:, 3] > 0.5) & (expected.mean > MARGIN * self.reference.scale.root_near)
-        ratio = np.where(
-            shown, 2 * np.log(np.maximum(load, 1e-6) / np.maximum(expected.mean, 1e-6)), 0.0
-        )
+        ratio = 2 * np.log(np.maximum(load, 1e-6) / np.maximum(expected.mean, 1e-6))
         error = 2 * spread / np.maximum(expected.mean, 1e-6)
-        plain = weight = np.where(shown & np.isfinite(spread), 1 / error**2, 0.0)
-        mean = np.zeros(load.shape[1])
+        return np.where(shown, ratio, 0.0), np.where(shown, error, np.inf)
+
+    def _ratios(self, features: Array, expected: Prediction) -> tuple[Floats, Floats]:
+        """Return the mean of 2 log(y / m) of each cell, and its variance, ``[D]``; NaN: too few
+        events."""
+        ratio, error = self._each_ratio(features, expected)
+        plain = weight = 1 / error**2
+        mean = np.zeros(ratio.shape[1])
         for _ in range(10):  # iteratively reweighted
             mean = (weight * ratio).sum(axis=0) / np.maximum(weight.sum(axis=0), 1e-12)
             weight = plain * np.minimum(
@@ -375,7 +413,21 @@ def _shrunk(log_gain: Floats, variance: Floats) -> Floats:
     return shrunk
 
 
-def _filled(recording: NDArray[Any], reference: Reference) -> Floats | None:
+def noise_of(recordings: Sequence[Floats]) -> Floats:
+    """Return the standard deviation of the noise of each cell in the quietest times, ``[D]``."""
+    quiet = [
+        frames[: len(frames) // FEWEST * FEWEST].reshape(-1, FEWEST, frames.shape[1]).std(axis=1)
+        for frames in recordings
+    ]
+    spreads = np.concatenate(quiet)
+    if not len(spreads):
+        return np.zeros(recordings[0].shape[1])
+    least = np.sqrt(chi2.ppf(LOW, FEWEST - 1) / FEWEST)  # spread of so few normal errors
+    noise: Floats = np.quantile(spreads, LOW, axis=0) / least
+    return noise
+
+
+def complete(recording: NDArray[Any], reference: Reference) -> Floats | None:
     """Return a recording with the last reading where one is missing; None without any reading."""
     frames = np.asarray(recording, dtype=np.float64)
     if not np.isfinite(frames).any():

@@ -27,6 +27,7 @@ _CONTEXTS = (_LEVELS + 1) * QUIET_LEVELS
 _QUIET = np.array([0.3, 0.7])  # shares of the cells at rest that do not dither
 _ALL = 0.9  # share of a line's cells that hold a value, where it does
 _FEWEST_ON_LINE = 4
+_WITNESSES = 3  # recordings whose median is no cell's jump to the value it is stuck at
 
 
 @dataclass(frozen=True)
@@ -196,9 +197,14 @@ class _Search:
     def _symbols(self, layout: SensorLayout) -> NDArray[np.intp]:
         """Return the symbol of each cell in each recording, ``[n, D]``.
 
-        What all cells of a pad at rest share is no other value.
+        What all cells of a pad at rest share is no other value. A cell rests at what it reads
+        lowest in the recordings in which it moves: where it fails early, what it is stuck at lasts
+        longer. One that hardly ever moves has no value that is known to be its rest.
         """
-        away = self._spans.middles - _medians(self._spans.low, axis=0)
+        moves = self._moved & self._known
+        rest = _medians(np.where(moves, self._spans.low, np.nan), axis=0)
+        rest[moves.sum(axis=0) < _WITNESSES] = np.nan
+        away = self._spans.middles - rest
         still = np.where(self._moved | ~self._known, np.nan, away)
         for pad in range(layout.pads):
             of_pad = layout.pad_of == pad

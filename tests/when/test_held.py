@@ -61,6 +61,26 @@ def test_any_set_of_recordings_in_which_cells_are_dead_is_found(grasps, cells, w
     assert (suspect & truth).sum() >= 0.7 * truth.sum()
 
 
+@settings(max_examples=12)
+@given(
+    since=st.integers(6, N - 6),
+    value=st.sampled_from([0.0, 1.5, 2.5, 5.0]),
+    cells=st.sampled_from([[0, 7], ROW[2:4], [18, 27, 56, 63]]),
+    quiet=st.booleans(),
+)
+def test_what_a_cell_rested_at_before_it_stuck_is_no_held_value(grasps, since, value, cells, quiet):
+    log = [
+        np.where(recording > 0.3, recording, 0.1) if quiet else recording for recording in grasps
+    ]
+    log = [recording.copy() for recording in log]
+    log[since - 1][-5:, cells] = value
+    for recording in log[since:]:
+        recording[:, cells] = value
+    suspect = found(log)
+    assert not suspect[:since].any()
+    assert not np.delete(suspect, cells, axis=1).any()
+
+
 def test_nothing_is_suspect_in_healthy_recordings(grasps):
     assert not found(grasps).any()
     quiet = [np.where(recording > 0.2, recording, 0.0) for recording in grasps]

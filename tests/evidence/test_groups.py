@@ -114,6 +114,15 @@ def test_a_finger_that_a_flat_object_presses_beyond_the_range_is_healthy(fitted)
     assert fitted.diagnose(log).faults == ()
 
 
+@pytest.mark.parametrize("gain", [3, 5])
+def test_the_noise_of_cells_with_a_higher_gain_is_no_load_of_their_finger(fitted, gain: float):
+    log = recordings(30, 2)
+    for frames in log:
+        frames[:, [8, 15]] = np.clip(np.rint(gain * frames[:, [8, 15]]), 0, 255)
+    faults = fitted.diagnose(log).faults
+    assert [fault.cells for fault in faults] == [(8,), (15,)]
+
+
 @pytest.mark.parametrize("gain", [0.03, 0.1, 0.2, 0.35])
 def test_worn_cells_are_weak_with_their_gain_and_no_pad_is_replaced(fitted, gain: float):
     rng = np.random.default_rng(0)

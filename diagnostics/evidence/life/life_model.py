@@ -170,7 +170,7 @@ class GroupModel(HealthyTable):
             own = frames[:, on]
             spread = np.ptp(own, axis=1)
             one = spread <= _NOISIER * 2 * self.tolerance
-            found[:, g] = one & root[:, on].any(axis=1)
+            found[:, g] = one & (root[:, on].astype(bool).mean(axis=1) > MAJORITY)
             if self.noise:
                 same = np.all(own[1:] == own[:-1], axis=1)
                 found[:, g] |= spread == 0
@@ -200,7 +200,9 @@ class GroupModel(HealthyTable):
                 continue
             full = loads[:, cells] >= FULL
             all_full = full.all(axis=1)
-            where = np.where(all_full, 2, (loads[:, cells] > UNLOADED).any(axis=1))
+            # Of one cell alone it may be noise.
+            loaded = (loads[:, cells] > UNLOADED).mean(axis=1) > MAJORITY
+            where = np.where(all_full, 2, loaded)
             spread = np.ptp(readings[:, cells], axis=1)
             one = spread <= 2 * self.tolerance  # of missing ones: not
             held: Mask = np.all(constant[:, cells], axis=1) & self.noise

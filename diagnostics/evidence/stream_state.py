@@ -271,12 +271,13 @@ class StreamState:
         """Return the cells at rest of pads that nothing shows to be in use, bool ``[D]``.
 
         Such a pad has no loaded cell that is ``alive``, and most of its cells were never loaded,
-        nor hold a reading below their rest, while another pad is in use. Nothing touched it, or it
-        is cut off where it rests: the readings are the same.
+        nor hold full scale or a reading below their rest, while another pad is in use. Nothing
+        touched it, or it is cut off where it rests: the readings are the same.
         """
         below = self.runs.value < self.scale.baseline - self.scale.near
         below &= ~self.runs.moved
-        still = self.present & ~below & ~self.touched & np.isfinite(self.lowest)
+        full = ~self.runs.moved & (self.runs.value >= self.scale.full_scale - self.scale.near)
+        still = self.present & ~below & ~full & ~self.touched & np.isfinite(self.lowest)
         of_pad = self.layout.pad_of
         pads = self.layout.pads
         share = np.bincount(of_pad[still], minlength=pads)

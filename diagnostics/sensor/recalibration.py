@@ -308,7 +308,8 @@ class Fit:
         have, beyond that of another gain."""
         low: Floats = np.quantile(np.concatenate(recordings), LOW, axis=0)
         came = np.maximum(noise_of(recordings) - 2 * self.noise, 0.0)
-        return low - ndtri(LOW) * came if np.median(came[self.used]) > 0 else low
+        noisier = self.used.any() and np.median(came[self.used]) > 0
+        return low - ndtri(LOW) * came if noisier else low
 
     def scores(self, recordings: Sequence[Floats], log_gain: Floats, offset: Floats) -> Floats:
         """Return the log pseudo-likelihood of each recording, with the readings corrected."""

@@ -137,3 +137,15 @@ def test_a_log_without_any_reading_is_refused():
 def test_a_cell_that_never_delivers_a_reading_is_faulty_and_does_not_disturb_the_fit(grasps):
     silent = [np.where(np.arange(64) == 30, np.nan, recording) for recording in grasps]
     assert SelfDiagnosis(LAYOUT).diagnose(silent).fault_set == {30}
+
+
+def test_a_cell_at_full_scale_on_a_pad_that_nothing_touched_is_short_without_a_reference():
+    layout = SensorLayout(2, 5, 5)
+    rng = np.random.default_rng(0)
+    log = [np.asarray(frames) for frames in simulate(4, layout, n_frames=50, seed=1).frames]
+    for frames in log:
+        frames[:, 25:] = np.abs(rng.normal(0.05, 0.002, (len(frames), 25)))
+        frames[:, [31, 44]] = layout.full_scale
+    diagnosis = SelfDiagnosis(layout).diagnose(log)
+    assert sorted(diagnosis.fault_set) == [31, 44]
+    assert {fault.kind for fault in diagnosis.faults} == {FaultKind.SHORT}

@@ -11,8 +11,8 @@ without it, in which one cell counts 4 at most. The log is of two sensors where
 - the recordings of the reference belong to one group: what it shows itself now and then, as the
   rest of a pad beside one that is loaded, is no other sensor;
 - most cells take part: either half of each group gives them the same differences, by a standard
-  deviation of log 1.3 or 0.5 % of full scale (:mod:`diagnostics.sensor.recalibration`), or
-  all cells of the pad rest 5 % of full scale apart;
+  deviation of log 1.3 or 0.5 % of full scale (:mod:`diagnostics.sensor.recalibration`), or all
+  cells of the pad rest 10 % of full scale apart, evenly;
 - neighbours differ independently: what lies on the array is no sensor.
 
 Not detected: fewer than three recordings of a sensor, sensors that read alike, and gains where
@@ -32,13 +32,7 @@ from scipy.stats import median_abs_deviation
 from sklearn.covariance import ledoit_wolf
 
 from diagnostics.evidence.drift import GAIN
-from diagnostics.preprocessing.levels import (
-    CERTAIN_RATIO,
-    FEWEST,
-    LIGHT,
-    MAJORITY,
-    SLIGHT,
-)
+from diagnostics.preprocessing.levels import CERTAIN_RATIO, FEWEST, LIGHT, MAJORITY, SLIGHT
 from diagnostics.sensor.recalibration import (
     Fit,
     common_spread,
@@ -250,13 +244,12 @@ class _Signatures:
         """Return the log likelihood ratio ``group`` (bool ``[n]``) : the others of each recording,
         learned without it, ``[n]``, or of other recordings."""
         each = of or self
-        alone = 1.0 if of is None else 0.0
         ratio = np.zeros(each.value.shape)
         known = each.precision > 0
         spread = 1 / np.maximum(each.precision, _TINY)
         for some, sign in ((group, 1.0), (~group, -1.0)):
-            own = alone * some[:, None] * self.precision if of is None else 0.0
-            weight = (self.precision[some]).sum(axis=0) - own
+            own = some[:, None] * self.precision if of is None else 0.0
+            weight = self.precision[some].sum(axis=0) - own
             total = (self.precision[some] * self.value[some]).sum(axis=0) - own * each.value
             learned = weight > _TINY
             known = known & learned
@@ -403,9 +396,9 @@ class _Pad:
 
     def _is_uniform(self, offset: Floats) -> bool:
         """Return whether all cells that rest read more, or less, by as much: no load does that."""
-        of_cells = offset[self.readings.rests]
         if self.readings.rests.mean() <= MAJORITY:
             return False
+        of_cells = offset[self.readings.rests]
         shared = float(np.median(of_cells))
         even = np.abs(of_cells - shared).max() <= abs(shared) / 2
         return bool(even and abs(shared) >= 2 * LIGHT * self.fit.reference.scale.full_scale)

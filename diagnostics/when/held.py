@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import expit
 
-from diagnostics.preprocessing.levels import CERTAIN_RATIO, FEWEST, MAJORITY
+from diagnostics.preprocessing.levels import CERTAIN_RATIO, FEWEST, MAJORITY, SUSPICIOUS
 from diagnostics.when.mixture import QUIET_LEVELS, Found, Mixture, Symbol
 from diagnostics.when.spans import Spans
 
@@ -20,6 +20,8 @@ Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 SUSPECT = 8.0  # log odds from which on nothing is learned from a cell in these recordings
+# of a line: where its cells agree, healthy ones that a task leaves untouched hardly do
+SUSPECT_LINE = SUSPICIOUS
 _FEWEST = 2 * FEWEST  # recordings
 _ROUNDS = 5  # at most: a size
 _LEVELS = 8  # of how far the cells beside one move: a size
@@ -147,7 +149,7 @@ class _Search:
             if len(self._on):
                 context, told = self._line_contexts(trusted)
                 lines = self._step(self._lines, number, context, told, lines)
-                of_lines = lines.states & (lines.evidence > self._limit(number))
+                of_lines = lines.states & (lines.evidence > self._limit(number, lines=True))
                 on_line = of_lines.astype(np.float64) @ self._on > 0
                 found = found | on_line & ~self._moved & self._known
                 each = np.where(self._on > 0, lines.evidence[:, None], -np.inf)
@@ -164,9 +166,11 @@ class _Search:
         return self._concluded(evidence, suspect)
 
     @staticmethod
-    def _limit(number: int) -> float:
+    def _limit(number: int, *, lines: bool = False) -> float:
         """Return the log odds of a suspicion: none at first."""
-        return 0.0 if number == 0 else SUSPECT
+        if number == 0:
+            return 0.0
+        return SUSPECT_LINE if lines else SUSPECT
 
     def _step(
         self,
@@ -181,7 +185,8 @@ class _Search:
             return Found(np.full(told.shape[1], -np.inf), np.zeros_like(told))
         if last is None:
             return mixture.first(context, told)
-        trusted = ~(last.states & (last.evidence > self._limit(number - 1)))
+        limit = self._limit(number - 1, lines=mixture is self._lines)
+        trusted = ~(last.states & (last.evidence > limit))
         return mixture.again(context, told, trusted, new=number == 1)
 
     def _concluded(self, evidence: Floats, suspect: Mask) -> Held:

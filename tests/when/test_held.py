@@ -87,6 +87,26 @@ def test_nothing_is_suspect_in_healthy_recordings(grasps):
     assert not found(quiet).any()
 
 
+@pytest.mark.parametrize("seed", [2, 8])
+def test_a_row_that_dies_between_two_tasks_is_suspect_in_the_later_ones(seed):
+    hand = SensorLayout(2, 10, 8, full_scale=3.3)
+    made = simulate(
+        8, hand, n_frames=60, seed=seed, classes=("nothing", "normal", "softer", "harder")
+    )
+    order = np.argsort(made.labels, kind="stable")
+    log = [np.array(made.frames[i]).reshape(60, -1) for i in order]
+    tasks = np.asarray(made.labels)[order]
+    spans = Spans.of(RecordingBlocks(log))
+    assert not find_held(spans, hand, TOLERANCE, tasks).suspect.any()
+    row = np.arange(64, 72)
+    for frames in log[16:]:
+        frames[:, row] = 0.0
+    suspect = find_held(Spans.of(RecordingBlocks(log)), hand, TOLERANCE, tasks).suspect
+    assert suspect[16:, row].mean() > 0.8
+    assert not np.delete(suspect, row, axis=1).any()
+    assert not suspect[:16].any()
+
+
 def test_few_recordings_say_nothing(grasps):
     assert not found(broken(grasps[:10], ROW, set(range(5)))).any()
 

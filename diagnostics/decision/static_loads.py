@@ -216,12 +216,11 @@ class _HeldLoads:
     def without_object(self, blamed: Mask) -> Floats:
         """Return the log likelihood without an object, ``[D]``; ``blamed`` (bool ``[D]``) are the
         faults elsewhere."""
-        full = np.isinf(self.values.high)
         constant = self.spatial.scored
         present = self.stream.present
         anywhere = 4 * self.stream.reference.tolerance / self.stream.scale.full_scale
         stuck = np.ones(len(self.root))
-        for alike in (constant & ~full, ~constant & ~full):
+        for alike in (constant, ~constant):
             share = max(EXPECTED * ANYWHERE, (blamed & alike).sum() / present.sum())
             stuck[alike] = share * anywhere
         log_likely: Floats = np.logaddexp(np.log(stuck), -self.surprisal)

@@ -248,15 +248,16 @@ class StreamState:
         0 where none do, or where it is more than in the reference.
         """
         usual = self.reference.rests
-        if usual is None:
+        if usual is None or not usual.any():
             return np.zeros(self.layout.n_cells)
         near = self.scale.near
         pad_of = self.layout.pad_of
         now = self.runs.last - self.scale.baseline
         least = self.least_loads()[0] ** 2 * self.scale.full_scale
         rests = np.zeros(self.layout.pads)
-        for above in (least, now):
-            even = even_rests(np.where(self.present, above, np.nan), pad_of, len(rests), near)
+        above = np.where(self.present, np.stack([least, now]), np.nan)
+        for of in above:
+            (even,) = even_rests(of[None], pad_of, len(rests), near)
             rests = np.where((even > near) & (even <= usual + near), even, rests)
         return rests[pad_of]
 

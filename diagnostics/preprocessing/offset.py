@@ -214,36 +214,38 @@ def levels_above(
 
 
 def even_rests(above: Floats, pad_of: NDArray[np.intp], pads: int, near: float) -> Floats:
-    """Return what half of the cells of each pad read within ``near`` of each other, ``[pads]``; NaN
-    where no half does.
+    """Return what half of the cells of each pad read within ``near`` of each other in each frame,
+    ``[n, pads]``: the middle of the shortest interval; NaN where no half does.
 
     Args:
-        above: ``[D]``, reading of each cell above its baseline; NaN: none, or no cell.
-        pad_of: int ``[D]``, pad of each cell.
+        above: ``[n, cells]``, readings above the baselines; a cell with NaN tells nothing.
+        pad_of: int ``[cells]``, pad of each cell.
         pads: their number.
         near: readings that differ by less agree.
     """
-    found = np.full(pads, np.nan)
+    found = np.full((len(above), pads), np.nan)
+    known = ~np.isnan(above).any(axis=0)
     for pad in range(pads):
-        ordered = np.sort(above[(pad_of == pad) & np.isfinite(above)])
-        half = len(ordered) // 2
+        ordered = np.sort(above[:, known & (pad_of == pad)], axis=1)
+        half = ordered.shape[1] // 2
         if half < FEWEST:
             continue
-        width = ordered[half:] - ordered[: len(ordered) - half]
-        first = int(width.argmin())
-        if width[first] <= near:
-            found[pad] = np.median(ordered[first : first + half + 1])
+        first = ordered[:, : ordered.shape[1] - half]
+        width = ordered[:, half:] - first
+        shortest = width.argmin(axis=1)[:, None]
+        span = np.take_along_axis(width, shortest, axis=1)[:, 0]
+        begin = np.take_along_axis(first, shortest, axis=1)[:, 0]
+        found[:, pad] = np.where(span <= near, begin + span / 2, np.nan)
     return found
 
 
 def highest_rests(recordings: Sequence[Floats], scale: Scale, layout: SensorLayout) -> Floats:
     """Return the highest even rest of each pad in recordings ``[T, D]``, ``[pads]``; 0 without
     any."""
-    present = layout.present.ravel()
-    frames = RecordingBlocks.of(recordings).thinned(np.arange(layout.n_cells))
-    above = np.where(present, frames - scale.baseline, np.nan)
-    rests = np.array([even_rests(one, layout.pad_of, layout.pads, scale.near) for one in above])
-    return np.asarray(np.nan_to_num(known_quantile(rests, 1 - LOW, axis=0)))
+    cells = spread(np.flatnonzero(layout.present))
+    above = RecordingBlocks.of(recordings).thinned(cells) - scale.baseline[cells]
+    rests = even_rests(above, layout.pad_of[cells], layout.pads, scale.near)
+    return np.nan_to_num(known_quantile(rests, 1 - LOW, axis=0)).clip(0.0, None)
 
 
 def _lows(readings: RecordingBlocks, which: range, cells: NDArray[np.intp]) -> Floats:

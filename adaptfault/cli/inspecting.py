@@ -132,9 +132,16 @@ def _inspected(
             cold,
             reference=healthy,
             n_recordings=len(log),
-            classes=log.labels,
+            classes=_classes(log),
             progress=advance,
         )
+
+
+def _classes(log: Opened) -> list[str] | None:
+    """Return the name of the class of each recording; None where they have none."""
+    if log.labels is None:
+        return None
+    return [log.class_names[label] if log.class_names else str(label) for label in log.labels]
 
 
 def _healthy(bundle: Bundle | None, recordings: Recordings | None) -> list[NDArray[Any]] | None:

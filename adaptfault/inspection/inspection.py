@@ -15,6 +15,7 @@ from adaptfault.inspection.changed_readings import (
     find_changed_readings,
     find_sensor_change,
 )
+from adaptfault.inspection.coincidence import coinciding
 from adaptfault.inspection.converter_range import within_range
 from adaptfault.inspection.severity import Name, of_faults, of_finding, untested, worst
 from diagnostics import Diagnosis, FaultSet, SelfDiagnosis, SensorLayout
@@ -146,7 +147,8 @@ def inspect(
         diagnoser: fitted on healthy recordings of the same array; one that is not fitted is a cold
             start, for which see :meth:`diagnostics.SelfDiagnosis.for_log`.
         reference: these recordings. None: nothing is compared with them.
-        classes: the class of each recording of the log, ``[n]``, for a cold start; None: unknown.
+        classes: the class of each recording of the log, ``[n]``, with which a fault may coincide;
+            None: unknown.
         progress: receives the share of the fit that is done, where a cold start fits to the log, or
             where the converter changed and the reference is learned as it would read it.
 
@@ -209,6 +211,8 @@ def inspect(
         *_of_change(change),
         *of_diagnosis(readings.diagnosis),
     ]
+    if classes is not None:
+        findings += [_told("coincides", text) for text in coinciding(readings.diagnosis, classes)]
     return Inspection(readings, tuple(findings), change, common)
 
 

@@ -39,6 +39,7 @@ Name = Literal[
     "common_spike",
     "swapped_in_part",
     "another_sensor",
+    "coincides",
 ]
 NAMES: tuple[str, ...] = get_args(Name)
 """Names of findings; they never change, because programs ask for them."""

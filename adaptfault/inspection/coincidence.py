@@ -51,5 +51,6 @@ def _sentence(names: Sequence[str], faults: Sequence[Fault], layout: SensorLayou
     verb = "coincide" if len(places) > 1 else "coincides"
     return (
         f"{'; '.join(places[:_LISTED])}{more} {verb} with {several} {', '.join(names)} and no"
-        " other: a model may learn the fault for the class; leave out these cells, or these recordings"
+        " other: a model may learn the fault for the class; leave out these cells, or these"
+        " recordings"
     )

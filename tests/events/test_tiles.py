@@ -2,6 +2,7 @@ import tracemalloc
 
 import numpy as np
 import pytest
+from conftest import without_calibration
 
 from diagnostics import (
     Fault,
@@ -51,7 +52,8 @@ def log(
 
 @pytest.fixture(scope="module")
 def fitted() -> SelfDiagnosis:
-    return SelfDiagnosis(SKIN).fit([log(SKIN, 199, seed) for seed in range(7)])
+    with without_calibration():
+        return SelfDiagnosis(SKIN).fit([log(SKIN, 199, seed) for seed in range(7)])
 
 
 def test_each_cell_is_an_output_of_one_tile_with_all_cells_near_it_on_its_pad_as_inputs():

@@ -146,7 +146,8 @@ def _mode(floors: Floats) -> float:
     lower = (low < ordered[first] - LIGHT).sum()
     if agree[first] < max(FEWEST, _AGREE * len(low)) or lower > _LOWER * len(low):
         return 0.0
-    return float(np.median(ordered[first : first + agree[first]]))
+    # a light load of its own raises a floor, and nothing lowers it
+    return float(np.quantile(ordered[first : first + agree[first]], LEAST_LOADED))
 
 
 def _carried(above: Floats, shares: Floats, layout: SensorLayout) -> Mask:

@@ -43,6 +43,8 @@ from diagnostics.evidence.stream_state import StreamState
 from diagnostics.faults import Fault, FaultKind
 from diagnostics.healthy.reference_faults import find_reference_faults, never_moved
 from diagnostics.layout import SensorLayout
+from diagnostics.model import Model, fit_model
+from diagnostics.model.findings import findings, shown
 from diagnostics.preprocessing.array_likes import plain_array
 from diagnostics.preprocessing.copies import find_copies
 from diagnostics.preprocessing.levels import (
@@ -75,6 +77,8 @@ from diagnostics.when.reference_findings import (
 SCHEMA = "adaptfault.diagnoser/1"
 
 # P(faulty) of silent, intermittent, noisy and drifting cells, which have their own thresholds
+_WHOLE_LOGS = "engine='model' judges whole logs and is not stored"
+_ENGINES = ("events", "model")
 _WHOLE = 1e-6  # by which a whole number may be missed after a conversion to loads and back
 _CERTAIN = 1 - RARE
 
@@ -107,6 +111,9 @@ class SelfDiagnosis:
         proof_of_life: with a reference, a cell that moves is ALIVE only where it depends on the
             others as a healthy cell does (:mod:`diagnostics.evidence.life`), so that dead cells
             that move are found. Without it, what moves counts as alive.
+        engine: ``"events"``, or ``"model"``: the one model of the array in time
+            (:mod:`diagnostics.model`), which is to replace it. It judges whole logs with a
+            reference; it tells no objects that lie still and no copies, and is not stored.
 
     Attributes:
         reference_: the healthy reference, after :meth:`fit`; None: cold start.
@@ -122,6 +129,7 @@ class SelfDiagnosis:
     calibrator_: Calibrator = Calibrator.cold()
     copies_: NDArray[np.intp] | None = None
     _certificate: Certificate | None = None
+    _model: Model | None = None
     _held_out: tuple[Sequence[NDArray[Any]], NDArray[np.float64]] | None = None
     reference_findings_: tuple[ReferenceFinding, ...] = ()
 
@@ -131,8 +139,12 @@ class SelfDiagnosis:
         *,
         false_discovery_rate: float = 0.006,
         proof_of_life: bool = True,
+        engine: str = "events",
     ) -> None:
+        if engine not in _ENGINES:
+            raise ValueError(f"engine: expected {' or '.join(map(repr, _ENGINES))}, got {engine!r}")
         self.layout = layout
+        self.engine = engine
         self.proof_of_life = proof_of_life
         self.load_ = LoadDirection.declared(layout)
         self._planes, self._order = axis_planes(layout)
@@ -145,6 +157,7 @@ class SelfDiagnosis:
             "layout": self.layout,
             "false_discovery_rate": self.false_discovery_rate,
             "proof_of_life": self.proof_of_life,
+            "engine": self.engine,
         }
 
     def set_params(self, **params: Any) -> SelfDiagnosis:
@@ -160,6 +173,7 @@ class SelfDiagnosis:
             )
         SelfDiagnosis.__init__(self, **(known | params))
         self.reference_ = None
+        self._model = None
         self.copies_ = None
         self.calibrator_ = Calibrator.cold()
         self._certificate = None
@@ -255,7 +269,10 @@ class SelfDiagnosis:
         usual = loads_of(healthy, near, living(layout, dead).present.ravel())
         floors = lowest_floors(healthy, self.reference_.scale.baseline, living(layout, dead))
         self.reference_ = replace(self.reference_, loads=usual, floors=floors)
-        if self.proof_of_life:
+        if self.engine == "model":
+            self._model = fit_model(list(healthy), layout, dead > 0, progress=progress)
+            calibrator = Calibrator.cold()
+        elif self.proof_of_life:
             self.reference_ = self.reference_.with_life(healthy, layout)
         if calibrator is None:
             calibrator = Calibrator.fit(healthy, living(layout, dead), progress=progress)
@@ -451,7 +468,13 @@ class SelfDiagnosis:
 
     def state(self) -> tuple[dict[str, Any], Arrays]:
         """Return the fitted state: a JSON-safe dict and arrays by name, as :meth:`from_state` reads
-        them."""
+        them.
+
+        Raises:
+            ValueError: ``engine="model"``.
+        """
+        if self.engine == "model":
+            raise ValueError(f"{_WHOLE_LOGS}: use engine='events' to store it")
         fitted, arrays = to_state(
             Fitted(
                 self.layout,
@@ -524,7 +547,7 @@ class SelfDiagnosis:
         """Return the diagnosis of the log behind ``stream``.
 
         Raises:
-            ValueError: no frame with a reading was received yet.
+            ValueError: no frame with a reading was received yet; ``engine="model"``.
         """
         with one_thread():
             return finished(self.steps(stream, n_recordings=n_recordings))
@@ -541,6 +564,8 @@ class SelfDiagnosis:
             life: the last result of :meth:`proof`, which is then not repeated, nor are the lines
                 of a shorted crossing tested; None: they are.
         """
+        if self._model is not None:
+            raise ValueError(f"{_WHOLE_LOGS}; got a stream: use diagnose, or engine='events'")
         stream = stream.complete()
         if not stream.received.any():
             raise ValueError("the recordings hold no frame with a reading: nothing to diagnose")
@@ -777,7 +802,49 @@ class SelfDiagnosis:
         stream.crosstalk = crosstalk
         for frames in log.blocks():
             stream.extend(frames)
+        if self._model is not None:
+            return self._diagnosed_by_model(self._model, log, stream.complete())
         return self.evaluate(stream, n_recordings=len(log))
+
+    def _diagnosed_by_model(
+        self, model: Model, log: RecordingBlocks, stream: StreamState
+    ) -> Diagnosis:
+        """Return what the model says of a log, whose ``stream`` tells what is lost on the way."""
+        if not stream.received.any():
+            raise ValueError("the recordings hold no frame with a reading: nothing to diagnose")
+        judgement = model.judge(self._in_planes(log))
+        full_scale = self.layout.full_scale
+        found = findings(judgement, stream, full_scale, self.false_discovery_rate)
+        aliases, _ = find_aliasing(stream)
+        of_cells = found.of(self._place)
+        causes, possible = root_causes(of_cells, aliases, self.layout)
+        probability = of_cells.probability.copy()
+        blamed = np.zeros(self.layout.n_cells, bool)
+        for fault in causes:
+            cells = list(fault.cells)
+            probability[cells] = np.maximum(probability[cells], fault.probability or 0.0)
+            blamed[cells] = True
+        working = of_cells.alive & ~blamed
+        rest = stream.scale.baseline + stream.scale.near
+        evidence = {
+            "spatial": of_cells.weight,
+            "temporal": np.zeros(len(blamed)),
+            "events": of_cells.events.astype(np.float64),
+        }
+        return Diagnosis(
+            layout=self.layout,
+            faults=causes,
+            probability=probability,
+            tested=(of_cells.alive & shown(judgement)[self._place]) | blamed,
+            transport=stream.transport.faults(
+                rest, working, self.layout.rate, moved=True, falls=self._falls(stream)
+            ),
+            evidence=evidence,
+            n_frames=stream.transport.seen,
+            n_recordings=len(log),
+            possible=possible,
+            contradicting=judgement.disturbed,
+        )
 
     def _diagnosed_when(
         self, log: RecordingBlocks, classes: ArrayLike | None, crosstalk: Crosstalk | None
@@ -797,15 +864,20 @@ class SelfDiagnosis:
 
     def _held(self, log: RecordingBlocks, tolerance: float, classes: ArrayLike | None) -> Held:
         """Return where cells hold a value although those beside them move."""
-        valid = log.valid(self.layout.full_scale, self.layout.present.ravel())
-        given = [np.asarray(frames, dtype=np.float64)[:, self._order] for frames in valid.given]
-        if self.load_ is not None:
-            given = [self.load_.loads(frames) for frames in given]
+        given = self._in_planes(log)
         held = find_held(Spans.of(RecordingBlocks(given)), self._planes, tolerance, classes)
         if self.load_ is not None:
             below = np.zeros(len(held.value), bool)
             held = replace(held, value=self.load_.readings(held.value, below))
         return held.of(self._place)
+
+    def _in_planes(self, log: RecordingBlocks) -> list[NDArray[np.float64]]:
+        """Return the loads of a log, each axis of a pad as a pad of its own."""
+        valid = log.valid(self.layout.full_scale, self.layout.present.ravel())
+        given = [np.asarray(frames, dtype=np.float64)[:, self._order] for frames in valid.given]
+        if self.load_ is None:
+            return given
+        return [self.load_.loads(frames) for frames in given]
 
     @staticmethod
     def _diagnosed_cold(

@@ -1,0 +1,124 @@
+"""E[load | others] and E[loaded | others] of each cell, from one covariance of both (Ledoit and
+Wolf 2004).
+
+With P the inverse of the covariance among the known cells, and a, b, c its entries of the load and
+the loadedness of cell i, both are left out together: the 2 x 2 block is inverted.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import cho_factor, cho_solve
+
+from diagnostics.events.tiles import tiles
+from diagnostics.layout import SensorLayout
+from diagnostics.model.record import Array, Cells, Mask
+
+_SURELY = 0.1  # root load that is surely one
+_CONSTANT = 1e-3  # standard deviation of an input that tells nothing
+_RIDGE = 1e-3
+
+Floats = NDArray[np.float64]
+
+
+def loaded(load: Array) -> Array:
+    """Return how surely cells are loaded, 0 to 1: little load is little sure."""
+    found: Array = np.minimum(load / _SURELY, 1).astype(np.float32)
+    return found
+
+
+def _both(load: Array) -> Floats:
+    return np.hstack([load, loaded(load)]).astype(np.float64)
+
+
+@dataclass(frozen=True)
+class Tile:
+    """Covariance of some cells, loads first, then how surely they are loaded.
+
+    Attributes:
+        inputs: int ``[k]``, the cells.
+        place: int, place among them of the cells that are predicted.
+        mean, deviation: ``[2 k]``; infinite: an input that tells nothing.
+        covariance: ``[2 k, 2 k]``.
+    """
+
+    inputs: Cells
+    place: Cells
+    mean: Floats
+    deviation: Floats
+    covariance: Floats
+
+    @classmethod
+    def fit(cls, load: Array, inputs: Cells, outputs: Cells) -> Tile:
+        """Fit to root loads ``[n, D]``."""
+        from sklearn.covariance import LedoitWolf
+
+        own = _both(load[:, inputs])
+        mean = own.mean(axis=0)
+        deviation = own.std(axis=0)
+        deviation = np.where(deviation < _CONSTANT, np.inf, deviation)
+        covariance = LedoitWolf(assume_centered=True).fit((own - mean) / deviation).covariance_
+        covariance[np.diag_indices(len(covariance))] += _RIDGE
+        return cls(inputs, np.searchsorted(inputs, outputs), mean, deviation, covariance)
+
+    def predict(self, load: Array, known: Mask) -> tuple[Floats, Floats]:
+        """Return both of the predicted cells, ``[n, k]`` each."""
+        one = known[self.inputs]
+        two = np.tile(one, 2)
+        z = (_both(load[:, self.inputs]) - self.mean) / self.deviation
+        found = np.zeros_like(z)
+        if two.any():
+            precision = cho_solve(
+                cho_factor(self.covariance[np.ix_(two, two)]), np.eye(int(two.sum()))
+            )
+            y = z[:, two] @ precision
+            found[:, two] = z[:, two] - _left_out(y, precision)
+            found[:, ~two] = y @ self.covariance[np.ix_(two, ~two)]
+        scale = np.where(np.isinf(self.deviation), 0, self.deviation)
+        found = found * scale + self.mean
+        n = len(one)
+        return found[:, :n][:, self.place], found[:, n:][:, self.place]
+
+
+def _left_out(y: Floats, precision: Floats) -> Floats:
+    """Return what is left of each pair of inputs once the others are known."""
+    n = len(precision) // 2
+    i = np.arange(n)
+    a = precision[i, i]
+    b = precision[i, i + n]
+    c = precision[i + n, i + n]
+    determinant = a * c - b * b
+    of_load = (c * y[:, :n] - b * y[:, n:]) / determinant
+    of_loaded = (a * y[:, n:] - b * y[:, :n]) / determinant
+    return np.hstack([of_load, of_loaded])
+
+
+@dataclass(frozen=True)
+class ConditionalMean:
+    """The conditional means of all cells, tile by tile."""
+
+    parts: tuple[Tile, ...]
+
+    @classmethod
+    def fit(cls, load: Array, layout: SensorLayout, living: Mask) -> ConditionalMean:
+        """Fit to root loads ``[n, D]``; ``living``: bool ``[D]``, cells that have a load at all."""
+        parts = []
+        for tile in tiles(layout):
+            inputs = tile.inputs[living[tile.inputs]]
+            outputs = tile.outputs[living[tile.outputs]]
+            if len(outputs):
+                parts.append(Tile.fit(load, inputs, outputs))
+        return cls(tuple(parts))
+
+    def predict(self, load: Array, known: Mask) -> tuple[Array, Array]:
+        """Return E[load | others] and E[loaded | others] by the ``known`` cells, ``[n, D]``
+        each."""
+        mean = np.zeros(load.shape, np.float32)
+        surely = np.zeros(load.shape, np.float32)
+        for part in self.parts:
+            outputs = part.inputs[part.place]
+            mean[:, outputs], surely[:, outputs] = part.predict(load, known)
+        return mean, surely

@@ -1,0 +1,207 @@
+"""Fits the model to fault-free recordings.
+
+Conditional means are cross-fitted: each recording is predicted by one that did not see it. The
+network learns with cells left out, as logs have faulty ones. Healthy logs that are held out tell
+how often each cell is odd, and the factor on the evidence of each way to fail: what it says of a
+healthy cell stays below certainty.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from diagnostics.layout import SensorLayout
+from diagnostics.model.conditional_mean import ConditionalMean
+from diagnostics.model.judge import Model
+from diagnostics.model.predictor import Network, Predictor
+from diagnostics.model.record import Array, Cells, Mask, Record, frames_of_piece, record_of
+from diagnostics.model.rest import fit_rest, step_of
+from diagnostics.model.symbols import (
+    NOTHING,
+    Flatness,
+    Symbols,
+    activity_of,
+    before_of,
+    root_load,
+)
+from diagnostics.model.ways import WAYS
+
+_FOLDS = 4
+_LEFT_OUT = (
+    0.0,
+    0.04,
+    0.1,
+    0.2,
+    0.4,
+    0.6,
+    1.0,
+)  # shares of the cells that the network goes without
+_EXAMPLES = 400_000  # of the network
+_UNLOADED = 5  # one in so many pieces in which nothing is loaded
+_LIVES = 1e-5  # of full scale: a range of readings
+_ODD_UNITS = 50.0  # units of all cells that weigh on the share of one
+_RARELY = 1e-3
+_OFTEN = 0.2
+_LOGS = 32
+_LENGTHS = (3, 6, 6, 30)  # recordings of a log
+_DEAD = (0.0, 0.04, 0.08, 0.16)  # shares of the cells that are dead in it
+_CERTAIN = 6.0  # evidence that a healthy cell does not reach
+_SAFETY = 1.5
+_TAIL = 0.995
+
+Recordings = Sequence[NDArray[np.floating]]
+
+
+@dataclass(frozen=True)
+class _Reference:
+    """The reference while the model is fitted.
+
+    Attributes:
+        recordings: ``[T, D]`` each.
+        record: of all of them.
+        load, level: of the record, ``[n, D]``.
+        living: bool ``[D]``.
+        fold: int, of each recording.
+        means: without each of the folds.
+    """
+
+    recordings: Recordings
+    record: Record
+    load: Array
+    level: NDArray[np.int8]
+    living: Mask
+    fold: Cells
+    means: Sequence[ConditionalMean]
+
+
+def fit_model(
+    recordings: Recordings,
+    layout: SensorLayout,
+    dead: Mask,
+    *,
+    progress: Callable[[float], None] = lambda share: None,
+) -> Model:
+    """Fit to fault-free recordings ``[T, D]`` of loads or readings, NaN: missing.
+
+    Args:
+        recordings: two at least.
+        layout: of the array; ``full_scale`` is the highest reading that there is.
+        dead: bool ``[D]``, cells that are dead in them.
+        progress: receives the share of the work that is done.
+    """
+    rng = np.random.default_rng(0)
+    recordings = [np.asarray(one, np.float32) for one in recordings]
+    present = layout.present.ravel()
+    full = float(layout.full_scale)
+    length = frames_of_piece(recordings)
+    record = record_of(recordings, length)
+    ranges = np.fmax.reduce(record.high) - np.fmin.reduce(record.low)
+    living = present & ~dead & (ranges > _LIVES * full)
+    rest = fit_rest(record, full, step_of(recordings, present, full), layout.pad_of, living)
+    above = rest.above(record, living)
+    symbols = Symbols.fit(above, rest, living)
+    load = root_load(above, rest)
+    level = symbols.levels(record, above)
+    flat = symbols.flat(record)
+    activity = activity_of(level, flat, living)
+    flatness = Flatness.fit(symbols.group(level), activity, flat, before_of(flat, record), living)
+    fold = rng.permutation(len(recordings)) % min(_FOLDS, len(recordings))
+    means = [
+        ConditionalMean.fit(load[fold[record.recording] != k], layout, living)
+        for k in range(fold.max() + 1)
+    ]
+    reference = _Reference(recordings, record, load, level, living, fold, means)
+    whole = ConditionalMean.fit(load, layout, living)
+    progress(0.1)
+    predictor = Predictor.of(load, layout, living, whole)
+    inputs, levels = _examples(predictor, reference, rng)
+    predictor.network = Network.fit(inputs, levels, symbols.n)
+    progress(0.5)
+    model = Model.of(symbols, flatness, predictor, length, present, living, layout.beside)
+    model.odd = _odd(model, reference)
+    progress(0.6)
+    model.factor = _factor(model, reference, rng)
+    predictor.mean = whole
+    progress(1.0)
+    return model
+
+
+def _examples(
+    predictor: Predictor, reference: _Reference, rng: np.random.Generator
+) -> tuple[Array, NDArray[np.int8]]:
+    """Return inputs and levels that the network learns, ``[n, k]`` and int ``[n]``."""
+    record = reference.record
+    load = reference.load
+    cells = np.flatnonzero(reference.living)
+    most = int(_EXAMPLES / len(cells) / len(reference.means) / len(_LEFT_OUT)) + 1
+    inputs = []
+    levels = []
+    for k, mean in enumerate(reference.means):
+        predictor.mean = mean
+        mine = np.flatnonzero(reference.fold[record.recording] == k)
+        part = rng.integers(0, len(_LEFT_OUT), len(mine))
+        for i, share in enumerate(_LEFT_OUT):
+            known = reference.living.copy()
+            known[rng.choice(cells, int(share * len(cells)), replace=False)] = False
+            of_part = mine[part == i]
+            on = load[of_part].max(axis=1) > NOTHING
+            of_part = of_part[on | (np.arange(len(of_part)) % _UNLOADED == 0)]
+            if not len(of_part):
+                continue
+            chosen = rng.choice(of_part, min(len(of_part), most), replace=False)
+            with_before = np.unique([chosen, np.maximum(chosen - 1, 0)])
+            told = load[with_before]
+            found = predictor.inputs(told, told, record.first[with_before], known)
+            found = found[np.searchsorted(with_before, chosen)][:, cells]
+            inputs.append(found.reshape(-1, found.shape[-1]))
+            levels.append(reference.level[chosen][:, cells].ravel())
+    return np.concatenate(inputs), np.concatenate(levels)
+
+
+def _odd(model: Model, reference: _Reference) -> Array:
+    """Return in which share of its units each healthy cell is odd, ``[D]``."""
+    odd = np.zeros(len(model.present))
+    units = 0
+    for k, mean in enumerate(reference.means):
+        model.predictor.mean = mean
+        held_out = np.flatnonzero(reference.fold == k)
+        log = model.log_of([reference.recordings[i] for i in held_out.tolist()])
+        observed = model.observed(log, model.living & log.received)
+        odd += observed.odd.sum(axis=0)
+        units += len(observed.odd)
+    pooled = max(odd[model.living].sum() / max(1, units * model.living.sum()), _RARELY)
+    share = (odd + _ODD_UNITS * pooled) / (units + _ODD_UNITS)
+    found: Array = np.clip(share, _RARELY, _OFTEN).astype(np.float32)
+    return found
+
+
+def _factor(model: Model, reference: _Reference, rng: np.random.Generator) -> Array:
+    """Return the factor on the evidence of each way and cell, ``[ways, D]``, from logs that are
+    held out, with dead cells beside."""
+    cells = np.flatnonzero(model.living)
+    highest = np.zeros((len(WAYS), len(model.present)))
+    every = []
+    for i in range(_LOGS):
+        k = i % len(reference.means)
+        model.predictor.mean = reference.means[k]
+        held_out = np.flatnonzero(reference.fold == k)
+        size = min(len(held_out), _LENGTHS[i // len(reference.means) % len(_LENGTHS)])
+        chosen = rng.choice(held_out, size, replace=False)
+        dead = rng.choice(cells, int(_DEAD[i % len(_DEAD)] * len(cells)), replace=False)
+        log = [reference.recordings[j].copy() for j in chosen.tolist()]
+        for cell in dead:
+            value = rng.uniform(0, 1) * model.symbols.rest.full
+            for frames in log:
+                frames[:, cell] = value
+        evidence = model.judge(log).evidence
+        healthy = np.setdiff1d(cells, dead)
+        highest[:, healthy] = np.maximum(highest[:, healthy], evidence[:, healthy])
+        every.append(evidence[:, healthy])
+    tail = np.quantile(np.concatenate(every, axis=1), _TAIL, axis=1)
+    highest = np.maximum(highest, tail[:, None])
+    found: Array = (_CERTAIN / np.maximum(_CERTAIN, _SAFETY * highest)).astype(np.float32)
+    return found

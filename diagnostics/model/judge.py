@@ -1,0 +1,209 @@
+"""The judgement of a log: who is trusted, the evidence of each way to fail, and P(faulty).
+
+Trusted are at first the cells that move and do not hold a load at the end. The worst of all leaves,
+and what is left is predicted anew, until nobody is suspect; then cells that did not move but read
+as the others say join them. With w the ways to fail and their evidence E_w,
+
+    log odds = log (p / (1 - p)) + log sum over w of  prior_w exp(E_w)
+
+where the prevalence p is that of the log (EM, shrunk to a usual one). Where many of the cells that
+move are refuted, the whole array does what the reference never saw: nobody is blamed for it.
+
+Not detected: an object that lies still (its cells hold a load); a wire whose cells fail together
+for a time and predict each other.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import expit, logit, logsumexp
+
+from diagnostics.model.observed import Log, Observed
+from diagnostics.model.over_time import USUAL, Units
+from diagnostics.model.predictor import Predictor
+from diagnostics.model.record import Array, Cells, Mask, Record, record_of
+from diagnostics.model.symbols import NOTHING, Flatness, Symbols
+from diagnostics.model.ways import WAYS, Way
+
+_SUSPECT = 3.0  # evidence of a fault with which a cell predicts no other
+_WORST = 0.5  # of the highest evidence: who leaves in one round
+_ROUNDS = 8
+_HELD = 3  # pieces at the end at one load: it may be stuck
+_PREVALENCE = 0.03
+_WEIGHS = 20.0  # cells that the usual prevalence is worth
+_ITERATIONS = 10
+_EXPLAINS = 0.5  # of the evidence of any way: a value that is held
+_DISTURBED = 1 / 3  # of the cells that move
+_FEWEST = 8  # cells that show a disturbance
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """What a log says of each cell, ``[D]``.
+
+    Attributes:
+        evidence: ``[ways, D]``, of each way to fail.
+        log_odds: float, faulty : healthy, with the usual prevalence.
+        probability: float, P(faulty).
+        way: int, number of the likeliest way.
+        known: bool, trusted cells.
+        observed: what these say of the log.
+        units: of the log.
+        disturbed: share of the cells that move which are refuted, where it is so large that none of
+            them is faulty; else 0.
+    """
+
+    evidence: Array
+    log_odds: Floats
+    probability: Floats
+    way: Cells
+    known: Mask
+    observed: Observed
+    units: Units
+    disturbed: float
+
+
+@dataclass
+class Model:
+    """All that a log is judged with.
+
+    Attributes:
+        symbols, flatness, predictor: of healthy cells.
+        length: frames of a piece.
+        present, living: bool ``[D]``, cells that there are, and that ever moved.
+        beside: int ``[D, k]``, cells beside each one; -1: none.
+        odd: ``[D]``, share of the units in which each healthy cell is odd.
+        factor: ``[ways, D]``, on the evidence of each way.
+    """
+
+    symbols: Symbols
+    flatness: Flatness
+    predictor: Predictor
+    length: int
+    present: Mask
+    living: Mask
+    beside: Cells
+    odd: Array
+    factor: Array
+
+    @classmethod
+    def of(
+        cls,
+        symbols: Symbols,
+        flatness: Flatness,
+        predictor: Predictor,
+        length: int,
+        present: Mask,
+        living: Mask,
+        beside: Cells,
+    ) -> Model:
+        """Return the model before healthy logs tell how odd cells are."""
+        odd = np.full(len(present), USUAL, np.float32)
+        factor = np.ones((len(WAYS), len(present)), np.float32)
+        return cls(symbols, flatness, predictor, length, present, living, beside, odd, factor)
+
+    def log_of(self, recordings: Sequence[NDArray[np.floating]]) -> Log:
+        """Return a log, recordings ``[T, D]``, as symbols."""
+        return self.log_of_record(record_of(recordings, self.length))
+
+    def log_of_record(self, record: Record) -> Log:
+        """Return a record as symbols."""
+        return Log(record, self.symbols, self.present, self.living)
+
+    def observed(self, log: Log, known: Mask) -> Observed:
+        """Return what the ``known`` cells say of a log."""
+        return Observed(log, known, self.predictor, self.flatness)
+
+    def judge(self, recordings: Sequence[NDArray[np.floating]]) -> Judgement:
+        """Judge a log, recordings ``[T, D]``."""
+        log = self.log_of(recordings)
+        known = self._trusted(log)
+        observed = self.observed(log, known)
+        units = Units.of(observed, self.odd)
+        evidence = np.stack([way.evidence(observed, units) for way in WAYS]) * self.factor
+        log_odds: Floats = logit(_PREVALENCE) + _of_any(evidence, WAYS)
+        # what never moved, here or in the reference, and rests: nothing is known of it
+        judged = log.received & (self.living | (log.level[-1] > 0))
+        probability = np.where(judged, _with_prevalence(log_odds, judged), 0.0)
+        return Judgement(
+            evidence=evidence,
+            log_odds=log_odds,
+            probability=probability,
+            way=_likeliest(evidence),
+            known=known,
+            observed=observed,
+            units=units,
+            disturbed=self._disturbed(log, probability),
+        )
+
+    def _trusted(self, log: Log) -> Mask:
+        """Return who predicts the others, bool ``[D]``."""
+        deciding = [i for i, way in enumerate(WAYS) if way.decides]
+        ways = [WAYS[i] for i in deciding]
+        holds = (log.run >= _HELD) & (log.load[-1] > NOTHING)
+        moved = log.far.copy()
+        known = log.far & ~holds & self.living
+        for _ in range(_ROUNDS):
+            observed = self.observed(log, known)
+            units = Units.of(observed, self.odd)
+            each = np.stack([way.evidence(observed, units) for way in ways])
+            evidence = _of_any(each * self.factor[deciding], ways)
+            suspect = known & (evidence > _SUSPECT)
+            if suspect.any():
+                known = known & ~self._worst(suspect, known, evidence)
+                continue
+            joins = log.received & self.living & ~moved & (evidence < 0)
+            if not joins.any():
+                break
+            moved |= joins
+            known = known | joins
+        found: Mask = known
+        return found
+
+    def _worst(self, suspect: Mask, known: Mask, evidence: Array) -> Mask:
+        """Return the suspects that none beside them exceeds."""
+        worst = suspect & (evidence > _WORST * evidence[known].max())
+        counts = (self.beside >= 0) & known[self.beside]
+        others = np.where(counts, evidence[self.beside], -np.inf).max(axis=1, initial=-np.inf)
+        found: Mask = worst & (evidence >= others)
+        return found
+
+    @staticmethod
+    def _disturbed(log: Log, probability: Floats) -> float:
+        refuted = log.far & (log.run < _HELD) & (probability > 0.5)
+        share = float(refuted.sum() / max(1, log.far.sum()))
+        return share if refuted.sum() >= _FEWEST and share > _DISTURBED else 0.0
+
+
+def _of_any(evidence: Array, ways: Sequence[Way]) -> Array:
+    """Return the evidence ``[D]`` of any of the ways, of ``[ways, D]``."""
+    prior = np.log([way.prior for way in ways])
+    found: Array = logsumexp(evidence + prior[:, None], axis=0)
+    return found
+
+
+def _likeliest(evidence: Array) -> Cells:
+    """Return the way of each cell, int ``[D]``: that it holds a value, which tells more, where that
+    explains most of what any way does."""
+    best: Cells = evidence.argmax(axis=0)
+    holds = [i for i, way in enumerate(WAYS) if way.kind is None]
+    held = evidence[holds]
+    explains = held.max(axis=0) > _EXPLAINS * evidence.max(axis=0)
+    return np.where(explains, np.array(holds)[held.argmax(axis=0)], best)
+
+
+def _with_prevalence(log_odds: Floats, judged: Mask) -> Floats:
+    """Return P(faulty) ``[D]`` with the prevalence of the log."""
+    prevalence = _PREVALENCE
+    found: Floats = expit(log_odds)
+    for _ in range(_ITERATIONS):
+        total = found[judged].sum() + _WEIGHS * _PREVALENCE
+        prevalence = total / (judged.sum() + _WEIGHS)
+        found = expit(log_odds + logit(prevalence) - logit(_PREVALENCE))
+    return found

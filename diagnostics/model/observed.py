@@ -1,0 +1,137 @@
+"""What a log shows of each cell and piece, and how likely a healthy cell shows it."""
+
+from __future__ import annotations
+
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from diagnostics.model.predictor import Predictor
+from diagnostics.model.record import Array, Mask, Record
+from diagnostics.model.symbols import (
+    DITHER,
+    MOVES,
+    NOTHING,
+    Flatness,
+    Symbols,
+    activity_of,
+    before_of,
+    root_load,
+)
+
+_ODD = 5.0  # nats of a unit beyond those expected
+_LOOKS = np.log([[0.95, 0.03, 0.02], [0.1, 0.88, 0.02]])  # of a held value without and with dither
+_LEAST = 1e-6  # probability whose logarithm is taken
+
+
+class Log:
+    """A log as symbols.
+
+    Attributes:
+        record: its pieces.
+        received: bool ``[D]``, cells that deliver readings.
+        far: bool ``[D]``, those that move by more than a dither.
+        above: readings above rest ``[n, D]``, without what the pad shares.
+        load: root loads ``[n, D]``.
+        level, flat, before: int ``[n, D]``.
+        either: int8 ``[3, n, D]``, levels that a reading may have: near the edge of one, either.
+        value: ``[D]``, reading at the end.
+        holds: bool ``[n, D]``, pieces at this value.
+        run: int ``[D]``, of them, up to the end.
+    """
+
+    def __init__(self, record: Record, symbols: Symbols, present: Mask, living: Mask) -> None:
+        self.record = record
+        self.symbols = symbols
+        rest = symbols.rest
+        lowest = np.fmin.reduce(record.low)
+        highest = np.fmax.reduce(record.high)
+        self.received = present & record.received.any(axis=0)
+        self.far = self.received & (highest - lowest > DITHER * rest.full)
+        self.above = rest.above(record, living & self.received)
+        self.load = root_load(self.above, rest)
+        doubt = rest.near / 2
+        shifts = (0.0, -doubt, doubt)
+        self.either = np.stack([symbols.levels(record, self.above + shift) for shift in shifts])
+        self.level: NDArray[np.int8] = self.either[0]
+        self.flat = symbols.flat(record)
+        self.before = before_of(self.flat, record)
+        self.value = (record.low[-1] + record.high[-1]) / 2
+        low = self.value - symbols.tolerance
+        high = self.value + symbols.tolerance
+        self.holds = (record.low >= low) & (record.high <= high)
+        at_end = np.logical_and.accumulate(np.flip(self.holds, 0), 0)
+        self.run = at_end.sum(axis=0)
+
+    def likelihood(self, levels: Array, lag: int = 0) -> Array:
+        """Return log P of each piece from ``lag`` on by P(level) ``[n - lag, D, K]``: of the
+        likeliest level that the reading may have."""
+        chosen = self.either[:, lag:, :, None].astype(np.intp)
+        found: Array = np.log(np.take_along_axis(levels[None], chosen, 3)[..., 0].max(axis=0))
+        return found
+
+
+class Observed:
+    """What the ``known`` cells, bool ``[D]``, say of a log.
+
+    Attributes:
+        levels: P(level) ``[n, D, K]``.
+        of_level: log P(observed level) ``[n, D]``.
+        healthy: log P(observed level and flatness) ``[n, D]``.
+    """
+
+    def __init__(self, log: Log, known: Mask, predictor: Predictor, flatness: Flatness) -> None:
+        self.log = log
+        self.known = known
+        self.predictor = predictor
+        self.flatness = flatness
+        self.levels = predictor(log.load, log.load, log.record.first, known)
+        self.of_level = np.where(self._unwitnessed(), 0, log.likelihood(self.levels))
+        self.group = log.symbols.group(log.level)
+        cells = np.arange(log.level.shape[1])
+        activity = activity_of(log.level, log.flat, known)
+        given = flatness.given_others[cells, self.group, activity[:, None], log.flat]
+        self.healthy = self.of_level + given
+
+    def _unwitnessed(self) -> Mask:
+        """Return where a cell rests and nobody on its pad tells of a contact, bool ``[n, D]``: that
+        nothing touches a pad is no surprise, however often something usually does."""
+        log = self.log
+        pad = self.predictor.pad
+        of_pad = np.equal(pad[:, None], np.arange(pad.max() + 1))
+        witnesses = (log.load > NOTHING) & self.known
+        touched = (witnesses.astype(np.float32) @ of_pad.astype(np.float32) > 0)[:, pad]
+        found: Mask = (log.level == 0) & ~touched
+        return found
+
+    def constancy(self, *, dithers: bool) -> Array:
+        """Return the log ratio ``[n, D]`` of how flat a piece is, given the one before, where a
+        cell holds its value."""
+        log = self.log
+        cells = np.arange(log.level.shape[1])
+        healthy = self.flatness.chain[cells, self.group, log.before, log.flat]
+        ratio = _LOOKS[int(dithers)][log.flat] - healthy
+        found: Array = np.where(log.holds & (log.flat != MOVES), ratio, 0).astype(np.float32)
+        return found
+
+    def delayed(self, lag: int) -> Array:
+        """Return log P(observed level) ``[n, D]`` by what the others said ``lag`` pieces ago; by
+        what they say where nothing was said then."""
+        log = self.log
+        found = self.of_level.copy()
+        if len(found) > lag:
+            told = log.load[:-lag]
+            own = log.load[lag:]
+            levels = self.predictor(told, own, log.record.first[lag:], self.known)
+            found[lag:] = log.likelihood(levels, lag)
+        return found
+
+    @cached_property
+    def odd(self) -> Mask:
+        """Units in which cells read what a healthy one hardly does, bool ``[units, D]``."""
+        p = np.maximum(self.levels, _LEAST)
+        expected = (self.levels * np.log(p)).sum(axis=-1)
+        surprise = self.log.record.sum_of_units(self.of_level - expected)
+        found: Mask = surprise < -_ODD
+        return found

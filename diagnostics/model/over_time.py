@@ -1,0 +1,122 @@
+"""How the evidence of single pieces adds up over a log.
+
+Either side errs in a share e of the units (contamination, Huber 1964): with r the sum of the log
+ratios of a unit, it counts for
+
+    log ((1 - e) exp(r) + e) / ((1 - e) + e exp(r))
+
+and so for no more than log(1/e). e is what healthy cells of the reference show, cross-fitted, and
+more in a unit in which many cells are odd: then the whole array does what the reference never saw.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from diagnostics.model.observed import Observed
+from diagnostics.model.record import Array, Cells
+
+USUAL = 0.01  # share of the units in which a healthy cell is odd, before the reference tells
+_SURE = 30.0  # cells that this share is worth
+_RARELY = 0.001
+_OFTEN = 0.3
+_MOST = 40.0  # log ratio whose exponential is taken
+_FAILS = 0.05  # of the units, P(a fault that comes and goes comes)
+_RECOVERS = 0.15
+
+
+@dataclass(frozen=True)
+class Units:
+    """The units of a log.
+
+    Attributes:
+        begins: int ``[units]``, first piece of each.
+        of_piece: int ``[n]``, unit of each piece.
+        odd: ``[units, D]``, P(a healthy cell is odd).
+    """
+
+    begins: Cells
+    of_piece: Cells
+    odd: Array
+
+    @classmethod
+    def of(cls, observed: Observed, odd: Array) -> Units:
+        """Return the units of a log; ``odd``: ``[D]``, share in which each healthy cell is odd."""
+        record = observed.log.record
+        known = observed.known
+        strange = (observed.odd & known).sum(axis=1)
+        share = (strange + _SURE * USUAL) / (known.sum() + _SURE)
+        here = np.clip(share[:, None] / USUAL * odd, _RARELY, _OFTEN)
+        return cls(record.units, record.of_unit, here)
+
+    def of_units(self, ratio: Array) -> Array:
+        """Return the evidence of each unit ``[units, D]`` of log ratios ``[n, D]``."""
+        return _bounded(np.add.reduceat(ratio, self.begins, axis=0), self.odd)
+
+
+def _bounded(ratio: Array, odd: Array) -> Array:
+    like = np.exp(np.clip(ratio, -_MOST, _MOST))
+    found: Array = np.log(((1 - odd) * like + odd) / (1 - odd + odd * like))
+    return found
+
+
+def throughout(ratio: Array, units: Units) -> Array:
+    """Return the evidence ``[D]`` of a fault in all pieces."""
+    found: Array = units.of_units(ratio).sum(axis=0)
+    return found
+
+
+def _since_each(ratio: Array, units: Units) -> Array:
+    """Return the evidence ``[n, D]`` of a fault from each piece on."""
+    sums = _from_here(ratio)
+    ends = np.append(units.begins[1:], len(ratio))
+    behind = np.concatenate([sums, np.zeros((1, ratio.shape[1]))])[ends]
+    rest_of_unit = sums - behind[units.of_piece]
+    whole = units.of_units(ratio)
+    later = _from_here(whole) - whole
+    found: Array = _bounded(rest_of_unit, units.odd[units.of_piece]) + later[units.of_piece]
+    return found
+
+
+def _from_here(values: Array) -> Array:
+    found: Array = np.flip(np.cumsum(np.flip(values, 0), 0), 0)
+    return found
+
+
+def for_good(ratio: Array, units: Units) -> Array:
+    """Return the evidence ``[D]`` of a fault from some piece on: half of them begin with the first
+    one, the others anywhere."""
+    since = _since_each(ratio, units)
+    at_once: Array = since[0]
+    if len(since) == 1:
+        return at_once
+    most = since.max(axis=0)
+    later = np.log(np.exp(since[1:] - most).mean(axis=0) + np.finfo(float).tiny) + most
+    found: Array = np.logaddexp(at_once, later) - np.log(2)
+    return found
+
+
+def since(ratio: Array, units: Units) -> Cells:
+    """Return the likeliest first piece of a fault that lasts, int ``[D]``."""
+    each = _since_each(ratio, units)
+    each[0] += np.log(max(1, len(each) - 1))
+    found: Cells = each.argmax(axis=0)
+    return found
+
+
+def now_and_then(ratio: Array, units: Units) -> Array:
+    """Return the evidence ``[D]`` of a fault that comes and goes: a two-state Markov chain over the
+    units (forward algorithm, Rabiner 1989)."""
+    # a healthy cell that is odd now and then is what this fault looks like
+    odd = np.maximum(units.odd, USUAL)
+    likelihood = np.exp(_bounded(np.add.reduceat(ratio, units.begins, axis=0), odd))
+    gone = np.full(ratio.shape[1], _FAILS / (_FAILS + _RECOVERS))
+    total: Array = np.zeros(ratio.shape[1], np.float32)
+    for unit in likelihood:
+        gone = gone * (1 - _RECOVERS) + (1 - gone) * _FAILS
+        z = 1 - gone + gone * unit
+        total = total + np.log(z).astype(np.float32)
+        gone = gone * unit / z
+    return total

@@ -1,0 +1,172 @@
+"""P(level of a cell | the others, and what it read a piece ago): one small network for all cells.
+
+Its inputs are the conditional means, the mean loads around the cell, of its pad and of the array,
+how often the cell is loaded, and its own load a piece ago. As it knows the cell's past, the
+surprises of successive pieces are independent: a contact that the others do not explain counts
+once, when it begins.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from diagnostics.layout import SensorLayout
+from diagnostics.model.conditional_mean import ConditionalMean, loaded
+from diagnostics.model.record import Array, Mask
+from diagnostics.model.symbols import NOTHING
+
+_GUESS = 0.002  # of a uniform distribution in any prediction: models err
+_HIDDEN = (32, 32)
+_BATCH = 2048
+_STEPS = 1000
+_AVERAGED = 0.3  # of the last steps (Polyak and Juditsky 1992)
+_EPOCHS = 12  # at most
+_RATE = 0.02
+_RINGS = {1: (1,), 2: (2,), 4: (4, 5, 8)}  # squared distances of the cells of a ring
+
+
+@dataclass(frozen=True)
+class Network:
+    """A perceptron with the softmax over levels.
+
+    Attributes:
+        mean, deviation: of the inputs.
+        weights, biases: of the layers.
+    """
+
+    mean: Array
+    deviation: Array
+    weights: tuple[Array, ...]
+    biases: tuple[Array, ...]
+
+    @classmethod
+    def fit(cls, inputs: Array, level: NDArray[np.integer], n_levels: int) -> Network:
+        """Fit to inputs ``[n, k]`` and levels int ``[n]``; the same every time."""
+        from sklearn.neural_network import MLPClassifier
+
+        mean = inputs.mean(axis=0)
+        deviation = inputs.std(axis=0) + np.float32(1e-6)
+        z = (inputs - mean) / deviation
+        rng = np.random.default_rng(0)
+        steps = int(np.clip(_EPOCHS * len(z) / _BATCH, 50, _STEPS))
+        fit = MLPClassifier(_HIDDEN, learning_rate_init=_RATE, alpha=1e-6, random_state=0)
+        fit.batch_size = min(_BATCH, len(z))
+        averaged: list[Array] = []
+        taken = 0
+        for step in range(steps):
+            pick = rng.integers(0, len(z), fit.batch_size)
+            fit.partial_fit(z[pick], level[pick], classes=np.arange(n_levels))
+            if step >= steps * (1 - _AVERAGED):
+                taken += 1
+                layers = [*fit.coefs_, *fit.intercepts_]
+                if not averaged:
+                    averaged = [np.zeros_like(layer) for layer in layers]
+                for total, layer in zip(averaged, layers, strict=True):
+                    total += layer
+        layers = [(total / taken).astype(np.float32) for total in averaged]
+        half = len(layers) // 2
+        return cls(mean, deviation, tuple(layers[:half]), tuple(layers[half:]))
+
+    def __call__(self, inputs: Array) -> Array:
+        """Return P(level) ``[n, K]``."""
+        hidden = (inputs - self.mean) / self.deviation
+        for weight, bias in zip(self.weights[:-1], self.biases[:-1], strict=True):
+            hidden = np.maximum(hidden @ weight + bias, 0)
+        logits = hidden @ self.weights[-1] + self.biases[-1]
+        logits -= logits.max(axis=-1, keepdims=True)
+        found: Array = np.exp(logits)
+        found /= found.sum(axis=-1, keepdims=True)
+        return found
+
+
+@dataclass
+class Predictor:
+    """The distribution of the level of each cell.
+
+    Attributes:
+        living: bool ``[D]``, cells that have a load at all.
+        pad: int ``[D]``, pad of each cell.
+        rings: ``[D, D]`` each, the cells beside each one, by distance.
+        usual: ``[D, k]``, how often and how much each cell is loaded.
+        mean: the conditional mean; those of the folds take turns while the model is fitted.
+        network: None: not fitted yet.
+    """
+
+    living: Mask
+    pad: NDArray[np.intp]
+    rings: Sequence[Array]
+    usual: Array
+    mean: ConditionalMean
+    network: Network | None = None
+
+    @classmethod
+    def of(
+        cls, load: Array, layout: SensorLayout, living: Mask, mean: ConditionalMean
+    ) -> Predictor:
+        """Return the predictor without its network, for root loads ``[n, D]`` of the reference."""
+        on = load > NOTHING
+        share = on.mean(axis=0)
+        often = np.log((share + 0.002) / (1.002 - share))
+        much = load.sum(axis=0) / np.maximum(on.sum(axis=0), 1)
+        usual = np.stack([often, much, load.std(axis=0)], axis=1).astype(np.float32)
+        return cls(living, layout.pad_of, _rings(layout, living), usual, mean)
+
+    def inputs(self, load: Array, own: Array, first: Mask, known: Mask) -> Array:
+        """Return the inputs of the network, ``[n, D, k]``.
+
+        Args:
+            load: root loads ``[n, D]`` that the ``known`` cells (bool ``[D]``) tell.
+            own: root loads ``[n, D]`` of the cells themselves.
+            first: bool ``[n]``, a recording begins.
+            known: the cells that tell.
+        """
+        n, d = load.shape
+        told = np.where(known, load, 0).astype(np.float32)
+        on = loaded(told)
+        telling = known.astype(np.float32)
+        mean, surely = self.mean.predict(load, known)
+        mean = np.clip(mean, -0.2, 1)
+        surely = np.clip(surely, -0.3, 1.3)
+        columns = [mean, np.sqrt(np.maximum(mean, 0)), surely]
+        for ring in self.rings:
+            count = np.maximum(telling @ ring, 1)
+            columns += [told @ ring / count, on @ ring / count]
+        columns.append(np.broadcast_to(np.minimum(telling @ self.rings[0], 4), (n, d)))
+        of_pad = np.equal(self.pad[:, None], np.arange(self.pad.max() + 1)).astype(np.float32)
+        count = np.maximum(telling @ of_pad, 1)
+        columns += [(told @ of_pad / count)[:, self.pad], (on @ of_pad / count)[:, self.pad]]
+        columns.append(np.broadcast_to(told.mean(axis=1, keepdims=True), (n, d)))
+        columns += [np.broadcast_to(one, (n, d)) for one in self.usual.T]
+        last = _before(own, first)
+        columns += [last, loaded(last), _before(mean, first), _before(surely, first)]
+        columns.append(np.broadcast_to(first[:, None], (n, d)))
+        return np.stack(columns, axis=-1).astype(np.float32)
+
+    def __call__(self, load: Array, own: Array, first: Mask, known: Mask) -> Array:
+        """Return P(level) ``[n, D, K]``; arguments as for :meth:`inputs`."""
+        if self.network is None:
+            raise ValueError("the predictor has no network yet")
+        inputs = self.inputs(load, own, first, known)
+        found: Array = self.network(inputs.reshape(-1, inputs.shape[-1])).reshape(*load.shape, -1)
+        found = (1 - _GUESS) * found + np.float32(_GUESS / found.shape[-1])
+        return found
+
+
+def _before(values: Array, first: Mask) -> Array:
+    """Return the values a piece ago; 0: a recording begins."""
+    found = np.roll(values, 1, axis=0)
+    found[first] = 0
+    return found
+
+
+def _rings(layout: SensorLayout, living: Mask) -> list[Array]:
+    """Return which living cells lie around each one, ``[D, D]`` for each ring."""
+    shape = (layout.pads, layout.rows, layout.cols)
+    pad, row, col = np.unravel_index(np.arange(layout.n_cells), shape)
+    away = (row[:, None] - row) ** 2 + (col[:, None] - col) ** 2
+    beside = living & living[:, None] & (pad[:, None] == pad)
+    return [(beside & np.isin(away, distances)).astype(np.float32) for distances in _RINGS.values()]

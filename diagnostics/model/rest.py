@@ -1,0 +1,123 @@
+"""How cells rest, and what a pad shares: the offset by which all its cells read more or less.
+
+For pad p and piece t, with r the rest of each cell::
+
+    c_p(t) = w m,   m = middle of the shortest interval that holds half of (reading - r) over the
+                        cells of the pad (shorth, Andrews et al. 1972),
+    w = 1 where it is narrow, 0 where it is twice as wide
+
+It is subtracted where the interval is narrow: no contact is so even. All cells of the pad tell,
+constant ones as well: those that are trusted would be others once the offset is wrong.
+
+Not detected: an offset of a pad with few cells; one that comes with a contact of more than half of
+them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from diagnostics.model.record import Array, Cells, Mask, Record
+
+NARROW = 0.002  # of full scale: readings differ by it without a load
+_FEWEST = 6  # cells of a pad that tell what it shares
+_EVEN = 0.5  # of a negative offset: by which the cells that share it differ
+_NOISES = 3.0  # by which those that share a positive one differ; a contact may be even, too
+_UNSTEADY = 0.05  # of full scale: the rest of a cell differs between recordings by less
+
+
+@dataclass(frozen=True)
+class Rest:
+    """How cells read without a contact.
+
+    Attributes:
+        level: ``[D]``, reading of each cell at rest, in the layout's unit.
+        near: ``[D]``, readings this far above or below it are no load.
+        full: highest reading that the reference shows, or full scale.
+        high: ``[D]``, highest reading of each cell in the reference.
+        pad: int ``[D]``, pad of each cell.
+    """
+
+    level: Array
+    near: Array
+    full: float
+    high: Array
+    pad: Cells
+
+    def offset(self, record: Record, telling: Mask) -> Array:
+        """Return the offset of each cell's pad in each piece, ``[n, D]``; ``telling``: bool
+        ``[D]``, cells that are received and live."""
+        found = np.zeros(record.mean.shape, np.float32)
+        for pad in np.unique(self.pad).tolist():
+            cells = self.pad == pad
+            tell = np.flatnonzero(cells & telling)
+            if len(tell) < _FEWEST:
+                continue
+            middle, width = shortest_half(record.mean[:, tell] - self.level[tell])
+            noise = float(np.median(self.near[tell]))
+            below = np.maximum(noise, _EVEN * -middle)
+            limit = np.where(middle < 0, below, _NOISES * noise)
+            # twice as wide, nothing is shared; between, a part: a jump would look like a load
+            shared = middle * np.clip(2 - width / limit, 0, 1)
+            found[:, cells] = np.nan_to_num(shared)[:, None]
+        return found
+
+    def above(self, record: Record, telling: Mask) -> Array:
+        """Return how far each piece reads above the rest of the cell without what its pad shares,
+        ``[n, D]``."""
+        found: Array = record.mean - self.level - self.offset(record, telling)
+        return found
+
+
+def fit_rest(record: Record, full: float, step: float, pad: Cells, living: Mask) -> Rest:
+    """Return how cells of the reference rest; ``step``: of their converter; ``living``: bool
+    ``[D]``."""
+    first = np.flatnonzero(record.first)
+    least = max(NARROW * full, 2 * step)
+    level = _lowest(record.mean, first)
+    near = np.full_like(level, least)
+    high = np.fmax.reduce(record.high)
+    rest = Rest(level, near, full, high, pad)
+    for _ in range(2):
+        without = record.mean - rest.offset(record, living)
+        level = _lowest(without, first)
+        lowest = np.fmin.reduceat(without, first, axis=0)
+        spread = np.nanquantile(lowest, 0.5, axis=0) - np.nanquantile(lowest, 0.1, axis=0)
+        range_ = record.high - record.low
+        resting = np.where(without <= level + 2 * spread, range_, np.nan)
+        noise = np.nan_to_num(np.nanmedian(resting, axis=0))
+        unsteady = np.minimum(spread, _UNSTEADY * full)
+        near = np.fmax(least, 2 * np.fmax(noise, unsteady)).astype(np.float32)
+        rest = Rest(level, near, full, high, pad)
+    return rest
+
+
+def _lowest(readings: Array, first: Cells) -> Array:
+    """Return the typical lowest reading of a recording, ``[D]``; ``first``: first pieces."""
+    lowest = np.fmin.reduceat(readings, first, axis=0)
+    found: Array = np.nan_to_num(np.nanquantile(lowest, 0.25, axis=0)).astype(np.float32)
+    return found
+
+
+def shortest_half(values: Array) -> tuple[Array, Array]:
+    """Return middle and width of the shortest interval that holds half of the values of each row,
+    ``[n]`` each of ``[n, k]``."""
+    ordered = np.sort(values, axis=1)
+    half = values.shape[1] // 2
+    widths = ordered[:, half:] - ordered[:, : values.shape[1] - half]
+    widths = np.where(np.isnan(widths), np.inf, widths)
+    at = widths.argmin(axis=1)
+    row = np.arange(len(values))
+    middle = (ordered[row, at] + ordered[row, at + half]) / 2
+    return middle, widths[row, at]
+
+
+def step_of(recordings: list[NDArray[np.floating]], present: Mask, full: float) -> float:
+    """Return the step of the converter: the smallest usual difference of two readings."""
+    sample = np.concatenate([one[:: max(1, len(one) // 20), present] for one in recordings])
+    gaps = np.diff(np.unique(sample[np.isfinite(sample)]))
+    gaps = gaps[gaps > 1e-6 * full]
+    return float(np.quantile(gaps, 0.05)) if len(gaps) else 0.0

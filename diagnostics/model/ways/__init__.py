@@ -1,0 +1,14 @@
+"""The ways to fail, one file each; a new one is added to the tuple."""
+
+from __future__ import annotations
+
+from diagnostics.model.ways.clamped import CLAMPED
+from diagnostics.model.ways.comes_and_goes import COMES_AND_GOES
+from diagnostics.model.ways.floats import FLOATS
+from diagnostics.model.ways.holds import DITHERS, HOLDS
+from diagnostics.model.ways.late import LATE, LATER
+from diagnostics.model.ways.way import Way
+
+WAYS = (HOLDS, DITHERS, FLOATS, COMES_AND_GOES, LATE, LATER, CLAMPED)
+
+__all__ = ["WAYS", "Way"]

@@ -1,0 +1,45 @@
+"""Moves, but not with the others: P(level, flatness) is that of the cell's own pieces, this one
+left out.
+
+Not detected: what moves so little that it reads as at rest; a copy of a cell that the others
+predict.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from diagnostics.faults import FaultKind
+from diagnostics.model.observed import Observed
+from diagnostics.model.over_time import Units, for_good, since
+from diagnostics.model.record import Array, Cells
+from diagnostics.model.symbols import CONSTANT, MOVES
+from diagnostics.model.ways.way import Way
+
+_WEIGHS = 2.0  # pieces that any symbol is worth
+_LEAST = 0.02
+
+
+def _ratio(observed: Observed) -> Array:
+    log = observed.log
+    n, d = log.level.shape
+    kinds = log.symbols.n * (MOVES + 1)
+    symbol = log.level.astype(np.intp) * (MOVES + 1) + log.flat
+    of_cell = symbol + kinds * np.arange(d)
+    count = np.bincount(of_cell.ravel(), minlength=kinds * d)[of_cell] - 1
+    own = (count + _WEIGHS / kinds + _LEAST) / (n - 1 + _WEIGHS + _LEAST * kinds)
+    # a cell that rests is no less a healthy one for being quiet
+    quiet = (log.level == 0) & (log.flat == CONSTANT)
+    found: Array = np.log(own) - np.where(quiet, observed.of_level, observed.healthy)
+    return found * log.record.received
+
+
+def _evidence(observed: Observed, units: Units) -> Array:
+    return for_good(_ratio(observed), units)
+
+
+def _since(observed: Observed, units: Units) -> Cells:
+    return since(_ratio(observed), units)
+
+
+FLOATS = Way(FaultKind.FLOATING, 0.2, _evidence, _since)

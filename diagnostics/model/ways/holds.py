@@ -1,0 +1,55 @@
+"""Holds a value to the end of the log, from the start or from some piece on: stuck, open, short.
+
+r = log P(at the value) - log P(level | others, a piece ago), and how flat the piece is, given the
+one before: a healthy cell flickers, or moves while it is loaded.
+
+Not detected: a cell that rests where the others say no load; which cell of a pair that rests in
+turn.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+
+import numpy as np
+
+from diagnostics.model.observed import Observed
+from diagnostics.model.over_time import Units, for_good, since
+from diagnostics.model.record import Array, Cells
+from diagnostics.model.symbols import MOVES
+from diagnostics.model.ways.way import MISS, Way
+
+_CONSTANT = 0.5  # share of the pieces whose flatness counts as independent
+_EXPECTED = np.log([0.2, 0.4])  # P(value): anywhere in between; at rest or at the top
+
+
+def _ratio(observed: Observed, *, dithers: bool) -> Array:
+    log = observed.log
+    matches = log.holds & (log.flat != MOVES)
+    agree = np.log(log.symbols.width)[log.level]
+    holds = np.log(1 - MISS) - agree - observed.of_level
+    ratio = np.where(matches, holds, np.log(MISS))
+    found: Array = ratio + _CONSTANT * observed.constancy(dithers=dithers)
+    return found * log.record.received
+
+
+def _evidence(observed: Observed, units: Units, *, dithers: bool) -> Array:
+    log = observed.log
+    rest = log.symbols.rest
+    at_rest = np.abs(log.value - rest.level) <= rest.near + log.symbols.tolerance
+    at_top = log.value >= rest.full - log.symbols.tolerance
+    expected = _EXPECTED[(at_rest | at_top).astype(np.intp)]
+    found: Array = for_good(_ratio(observed, dithers=dithers), units) + expected
+    return found
+
+
+def _since(observed: Observed, units: Units, *, dithers: bool) -> Cells:
+    return since(_ratio(observed, dithers=dithers), units)
+
+
+def _way(prior: float, *, dithers: bool) -> Way:
+    return Way(None, prior, partial(_evidence, dithers=dithers), partial(_since, dithers=dithers))
+
+
+HOLDS = _way(0.35, dithers=False)
+DITHERS = _way(0.15, dithers=True)

@@ -1,0 +1,157 @@
+"""The one model: dead cells, cells that move by themselves, and healthy ones, in one judgement."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from sklearn.base import clone
+
+from diagnostics import FaultKind, Monitor, SelfDiagnosis, SensorLayout, Verdict
+from diagnostics.model import Model, fit_model
+from diagnostics.model.ways import WAYS
+
+LAYOUT = SensorLayout(1, 8, 8, full_scale=4095.0, rate=20.0, unit="count")
+REST = 40.0
+USED = (18, 27, 36, 45)  # cells in the middle, which presses reach often
+
+
+def presses(seed: int, recordings: int, frames: int = 60) -> list[np.ndarray]:
+    """Presses that come and go anywhere, in whole counts with noise."""
+    rng = np.random.default_rng(seed)
+    rows, cols = np.divmod(np.arange(64), 8)
+    found = []
+    for _ in range(recordings):
+        total = np.zeros((frames, 64))
+        for _ in range(3):
+            row, col = rng.uniform(0, 7, 2)
+            shape = np.exp(-((rows - row) ** 2 + (cols - col) ** 2) / 4)
+            begin = int(rng.integers(0, frames - 20))
+            course = np.zeros(frames)
+            course[begin : begin + 20] = np.sin(np.linspace(0, np.pi, 20))
+            total += 3000 * course[:, None] * shape
+        noise = rng.normal(0, 2, total.shape)
+        found.append(np.clip(REST + total + noise, 0, 4095).round())
+    return found
+
+
+@pytest.fixture(scope="module")
+def fitted() -> SelfDiagnosis:
+    return SelfDiagnosis(LAYOUT, engine="model").fit(presses(0, 80))
+
+
+@pytest.fixture(scope="module")
+def model() -> Model:
+    return fit_model(presses(0, 80), LAYOUT, np.zeros(64, bool))
+
+
+@pytest.fixture
+def healthy() -> list[np.ndarray]:
+    return presses(1, 8)
+
+
+def blamed(fitted: SelfDiagnosis, log: list[np.ndarray]) -> list[int]:
+    return list(fitted.diagnose(log).fault_set)
+
+
+def test_nobody_is_blamed_for_a_healthy_log_and_most_cells_are_alive(fitted, healthy):
+    diagnosis = fitted.diagnose(healthy)
+    assert not diagnosis.faults
+    alive = [verdict is Verdict.ALIVE for verdict in diagnosis.verdicts]
+    assert np.mean(alive) > 0.8
+
+
+@pytest.mark.parametrize("value", [REST, 1500.0, 4095.0])
+def test_cells_that_hold_a_value_are_found_with_it(fitted, healthy, value):
+    for frames in healthy:
+        frames[:, USED] = value
+    diagnosis = fitted.diagnose(healthy)
+    assert set(diagnosis.fault_set) == set(USED)
+    kinds = {REST: FaultKind.OPEN, 1500.0: FaultKind.STUCK, 4095.0: FaultKind.SHORT}
+    assert {fault.kind for fault in diagnosis.faults} == {kinds[value]}
+
+
+def test_a_cell_that_dies_in_the_log_is_told_with_about_its_frame(fitted, healthy):
+    for frames in healthy[4:]:
+        frames[:, 27] = 900.0
+    (fault,) = fitted.diagnose(healthy).faults
+    assert fault.cells == (27,)
+    assert fault.onset == pytest.approx(240, abs=16)
+
+
+def test_a_cell_that_moves_by_itself_floats(fitted, healthy):
+    swing = 1000 + 600 * np.sin(np.arange(480) / 9)
+    for i, frames in enumerate(healthy):
+        frames[:, 27] = swing[60 * i :][:60].round()
+    (fault,) = fitted.diagnose(healthy).faults
+    assert fault.cells == (27,)
+    assert fault.kind is FaultKind.FLOATING
+
+
+def test_a_cell_that_is_dead_in_every_second_recording_is_told_with_these(fitted):
+    log = presses(2, 30)
+    for frames in log[::2]:
+        frames[:, 27] = REST
+    (fault,) = fitted.diagnose(log).faults
+    assert fault.cells == (27,)
+    assert fault.recordings == tuple(range(0, 30, 2))
+
+
+def test_a_dead_row_is_one_fault(fitted, healthy):
+    for frames in healthy:
+        frames[:, 16:24] = REST
+    (fault,) = fitted.diagnose(healthy).faults
+    assert fault.cells == tuple(range(16, 24))
+    assert fault.line is not None
+
+
+def test_a_silent_cell_is_faulty(fitted, healthy):
+    for frames in healthy:
+        frames[:, 27] = np.nan
+    assert blamed(fitted, healthy) == [27]
+
+
+def test_missing_readings_are_no_fault(fitted, healthy, rng):
+    log = [np.where(rng.random(frames.shape) < 0.3, np.nan, frames) for frames in healthy]
+    assert blamed(fitted, log) == []
+
+
+def test_a_log_in_which_nothing_is_touched_blames_and_proves_nobody(fitted):
+    rng = np.random.default_rng(3)
+    log = [(REST + rng.normal(0, 2, (60, 64))).round() for _ in range(6)]
+    diagnosis = fitted.diagnose(log)
+    assert not diagnosis.faults
+    assert set(diagnosis.verdicts) == {Verdict.UNTESTED}
+
+
+def test_what_nothing_is_known_of_is_not_judged(model, healthy):
+    judgement = model.judge(healthy)
+    assert judgement.evidence.shape == (len(WAYS), 64)
+    assert judgement.probability.max() < 0.5
+    assert judgement.disturbed == 0
+
+
+def test_the_same_recordings_give_the_same_model(model, healthy):
+    again = fit_model(presses(0, 80), LAYOUT, np.zeros(64, bool))
+    np.testing.assert_array_equal(
+        again.judge(healthy).probability, model.judge(healthy).probability
+    )
+
+
+def test_an_unknown_engine_is_refused_with_those_there_are():
+    with pytest.raises(ValueError, match="'events' or 'model', got 'other'"):
+        SelfDiagnosis(LAYOUT, engine="other")
+
+
+def test_what_cannot_be_stored_or_streamed_is_refused(fitted, tmp_path, healthy):
+    with pytest.raises(ValueError, match="not stored"):
+        fitted.save(tmp_path / "diagnosis")
+    with pytest.raises(ValueError, match="whole logs"):
+        Monitor(fitted)
+    stream = fitted.stream()
+    stream.extend(healthy[0])
+    with pytest.raises(ValueError, match="whole logs"):
+        fitted.evaluate(stream)
+
+
+def test_a_clone_has_the_same_engine(fitted):
+    assert clone(fitted).engine == "model"

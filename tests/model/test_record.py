@@ -1,0 +1,62 @@
+"""The record of a log: every frame in one piece, no piece across recordings."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from diagnostics.model.record import UNIT, frames_of_piece, record_of
+
+LENGTHS = st.lists(st.integers(1, 40), min_size=1, max_size=5)
+
+
+def readings(lengths: list[int], seed: int) -> list[np.ndarray]:
+    rng = np.random.default_rng(seed)
+    return [rng.normal(size=(n, 3)).astype(np.float32) for n in lengths]
+
+
+@given(LENGTHS, st.integers(1, 8), st.integers(0, 9))
+def test_a_piece_holds_the_frames_between_its_beginning_and_the_next(lengths, length, seed):
+    log = readings(lengths, seed)
+    record = record_of(log, length)
+    whole = np.concatenate(log)
+    of_frame = np.repeat(np.arange(len(log)), lengths)
+    for i, (begin, end) in enumerate(zip(record.begins, record.ends(), strict=True)):
+        assert set(of_frame[begin:end]) == {record.recording[i]}
+        np.testing.assert_array_equal(record.low[i], whole[begin:end].min(axis=0))
+        np.testing.assert_array_equal(record.high[i], whole[begin:end].max(axis=0))
+        np.testing.assert_allclose(record.mean[i], whole[begin:end].mean(axis=0), atol=1e-5)
+    assert record.ends()[-1] == record.n_frames == len(whole)
+
+
+@given(LENGTHS, st.integers(1, 8))
+def test_a_unit_is_a_few_successive_pieces_of_one_recording(lengths, length):
+    record = record_of(readings(lengths, 0), length)
+    for unit in np.unique(record.of_unit):
+        pieces = np.flatnonzero(record.of_unit == unit)
+        assert len(pieces) <= UNIT
+        assert (np.diff(pieces) == 1).all()
+        assert len(set(record.recording[pieces])) == 1
+    values = np.arange(len(record), dtype=np.float32)[:, None]
+    assert record.sum_of_units(values).sum() == values.sum()
+
+
+def test_where_nothing_was_received_a_piece_reads_as_the_one_before():
+    frames = np.arange(12.0).reshape(12, 1)
+    frames[4:8] = np.nan
+    record = record_of([frames], 4)
+    np.testing.assert_array_equal(record.received[:, 0], [True, False, True])
+    np.testing.assert_array_equal(record.mean[:, 0], [1.5, 1.5, 9.5])
+
+
+def test_a_recording_that_begins_without_a_reading_takes_none_of_the_one_before():
+    before = np.full((4, 1), 7.0)
+    after = np.array([[np.nan]] * 4 + [[3.0]] * 4)
+    record = record_of([before, after], 4)
+    assert not record.received[1, 0]
+    assert record.mean[1, 0] != 7.0
+
+
+@pytest.mark.parametrize(("frames", "length"), [(1, 1), (12, 2), (60, 8), (1000, 8)])
+def test_a_short_recording_has_some_pieces_too(frames, length):
+    assert frames_of_piece([np.zeros((frames, 1))]) == length

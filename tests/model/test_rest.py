@@ -1,0 +1,51 @@
+"""How cells rest, and what a pad shares."""
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+
+from diagnostics.model.record import record_of
+from diagnostics.model.rest import fit_rest, shortest_half, step_of
+
+PAD = np.repeat([0, 1], 12)
+
+
+def touched(seed: int) -> list[np.ndarray]:
+    """Recordings of two pads that rest at 100; a few cells of the first are pressed."""
+    rng = np.random.default_rng(seed)
+    found = []
+    for _ in range(12):
+        frames = 100 + rng.normal(0, 1, (48, 24))
+        pressed = rng.choice(12, 4, replace=False)
+        frames[12:36, pressed] += 400
+        found.append(frames.round())
+    return found
+
+
+@given(st.lists(st.floats(-1e3, 1e3), min_size=2, max_size=30))
+def test_the_shortest_half_is_no_wider_than_any_other(values):
+    row = np.array([values], dtype=np.float32)
+    middle, width = shortest_half(row)
+    ordered = np.sort(row[0])
+    half = len(ordered) // 2
+    others = ordered[half:] - ordered[: len(ordered) - half]
+    assert width[0] == others.min()
+    assert ordered[0] <= middle[0] <= ordered[-1]
+
+
+def test_a_pad_that_sags_as_a_whole_is_told_by_how_much_and_the_other_is_not():
+    healthy = touched(0)
+    living = np.ones(24, bool)
+    rest = fit_rest(record_of(healthy, 8), 1000.0, 1.0, PAD, living)
+    log = touched(1)
+    for frames in log:
+        frames[:, 12:] -= 40
+    offset = rest.offset(record_of(log, 8), living)
+    np.testing.assert_allclose(offset[:, 12:], -40, atol=3)
+    assert np.abs(offset[:, :12]).max() < 3
+    np.testing.assert_allclose(rest.level, 100, atol=3)
+
+
+def test_the_step_of_the_converter_is_the_smallest_usual_difference():
+    readings = [(np.arange(200) % 13 * 4.0)[:, None]]
+    assert step_of(readings, np.ones(1, bool), 100.0) == 4.0

@@ -88,9 +88,10 @@ def test_faults_are_reported_in_the_sensors_own_readings(low, high, log):
 
 def test_the_monitor_says_the_same_frame_by_frame(low, high, log):
     monitors = Monitor(low), Monitor(high)
+    first = log[0][: len(log[0]) // 2]
     told = [
         [(fault.cells, fault.line) for frame in frames for fault in monitor.update(frame)]
-        for monitor, frames in zip(monitors, (log[0], FULL - log[0]), strict=True)
+        for monitor, frames in zip(monitors, (first, FULL - first), strict=True)
     ]
     assert told[0] == told[1] != []
     assert same(monitors[0].diagnosis(), monitors[1].diagnosis())

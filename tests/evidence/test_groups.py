@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from conftest import without_calibration
 
 from adaptfault.inspection.inspection import inspect
 from diagnostics import Diagnosis, FaultKind, Line, SelfDiagnosis, SensorLayout
@@ -38,7 +39,8 @@ def recordings(n: int, seed: int) -> list[np.ndarray]:
 
 @pytest.fixture(scope="module")
 def fitted() -> SelfDiagnosis:
-    return SelfDiagnosis(LAYOUT).fit(recordings(60, 1))
+    with without_calibration():
+        return SelfDiagnosis(LAYOUT).fit(recordings(60, 1))
 
 
 def failing(way: str, readings: np.ndarray, rng: np.random.Generator) -> np.ndarray:

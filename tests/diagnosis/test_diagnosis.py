@@ -237,14 +237,21 @@ def test_a_cell_whose_offset_drifts_away_is_found(fitted, log):
     assert (fault.kind, fault.cells) == (FaultKind.DRIFT, (cell,))
 
 
+@pytest.fixture(scope="module")
+def long_log(grasps: Recordings) -> list[np.ndarray]:
+    return [grasps.frames[i] for i in range(1, 140, 3)]
+
+
+def test_of_a_long_healthy_log_nothing_is_told(fitted, long_log):
+    assert not fitted.diagnose(long_log).faults
+
+
 @pytest.mark.parametrize(("which", "onset"), [(6, None), (24, 2000), (36, None)])
 def test_a_cell_that_has_lost_most_of_its_gain_is_found_with_that_reason(
-    fitted, grasps: Recordings, which, onset
+    fitted, long_log, which, onset
 ):
-    log = [grasps.frames[i] for i in range(1, 140, 3)]
-    assert not fitted.diagnose(log).faults
-    frames = np.concatenate(log)
-    cell = int(often_loaded(log)[which])
+    frames = np.concatenate(long_log)
+    cell = int(often_loaded(long_log)[which])
     frames[onset:, cell] *= 0.15
     (fault,) = fitted.diagnose(frames).faults
     assert (fault.kind, fault.cells) == (FaultKind.WEAK, (cell,))

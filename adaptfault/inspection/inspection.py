@@ -237,11 +237,13 @@ def _disturbances(
 def _without_groups(
     log: list[NDArray[np.float64]], diagnosis: Diagnosis
 ) -> list[NDArray[np.float64]] | None:
-    """Return a log without the readings of wires that are faulty as a whole; None without any."""
+    """Return a log without the readings of wires that are faulty as a whole; None without any, and
+    where no other cell is left."""
     cells = [cell for fault in diagnosis.faults if fault.line is not None for cell in fault.cells]
-    if not cells:
-        return None
     faulty = FaultSet(tuple(cells), diagnosis.layout.n_cells).mask
+    left = diagnosis.layout.present.ravel() & ~faulty
+    if not cells or not left.any():
+        return None
     return [np.where(faulty, np.nan, frames) for frames in log]
 
 

@@ -136,6 +136,7 @@ def test_the_diagnosis_clones_and_ends_a_pipeline():
         "layout": layout,
         "false_discovery_rate": 0.01,
         "proof_of_life": True,
+        "engine": "events",
     }
     pipeline = make_pipeline(FunctionTransformer(lambda counts: counts / 255), diagnoser)
     assert pipeline.fit(255 * presses(60, 0))[-1] is diagnoser

@@ -113,7 +113,7 @@ class SelfDiagnosis:
             that move are found. Without it, what moves counts as alive.
         engine: ``"events"``, or ``"model"``: the one model of the array in time
             (:mod:`diagnostics.model`), which is to replace it. It judges whole logs with a
-            reference; it tells no objects that lie still and no copies, and is not stored.
+            reference; it tells no objects that lie still, and is not stored.
 
     Attributes:
         reference_: the healthy reference, after :meth:`fit`; None: cold start.
@@ -271,6 +271,7 @@ class SelfDiagnosis:
         self.reference_ = replace(self.reference_, loads=usual, floors=floors)
         if self.engine == "model":
             self._model = fit_model(list(healthy), layout, dead > 0, progress=progress)
+            self._model.predictor.cell = self._order
             calibrator = Calibrator.cold()
         elif self.proof_of_life:
             self.reference_ = self.reference_.with_life(healthy, layout)

@@ -16,6 +16,7 @@ from diagnostics.preprocessing.levels import DOUBTED
 
 _SHOWN = 1.0  # evidence that excludes a way to fail, or suggests one
 _HELD = 3  # pieces
+_NO_READING = (FaultKind.LATE, FaultKind.COPY)  # but frames, or a cell
 
 Floats = NDArray[np.float64]
 
@@ -104,7 +105,7 @@ def _value(
     for i, way in enumerate(WAYS):
         if way.value is not None:
             told = way.value(judgement.observed).astype(np.float64)
-            if way.kind is not FaultKind.LATE:
+            if way.kind not in _NO_READING:
                 told = stream.reading(told)
             of_way = (judgement.way == i) & (refuted >= 0)
             found[of_way] = told[of_way]

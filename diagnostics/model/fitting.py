@@ -121,7 +121,7 @@ def fit_model(
     inputs, levels = _examples(predictor, reference, rng)
     predictor.network = Network.fit(inputs, levels, symbols.n)
     progress(0.5)
-    model = Model.of(symbols, flatness, predictor, length, present, living, layout.beside)
+    model = Model.of(symbols, flatness, predictor, length, present, living)
     model.odd = _odd(model, reference)
     progress(0.6)
     model.factor = _factor(model, reference, rng)

@@ -77,7 +77,6 @@ class Model:
         symbols, flatness, predictor: of healthy cells.
         length: frames of a piece.
         present, living: bool ``[D]``, cells that there are, and that ever moved.
-        beside: int ``[D, k]``, cells beside each one; -1: none.
         odd: ``[D]``, share of the units in which each healthy cell is odd.
         factor: ``[ways, D]``, on the evidence of each way.
     """
@@ -88,7 +87,6 @@ class Model:
     length: int
     present: Mask
     living: Mask
-    beside: Cells
     odd: Array
     factor: Array
 
@@ -101,12 +99,11 @@ class Model:
         length: int,
         present: Mask,
         living: Mask,
-        beside: Cells,
     ) -> Model:
         """Return the model before healthy logs tell how odd cells are."""
         odd = np.full(len(present), USUAL, np.float32)
         factor = np.ones((len(WAYS), len(present)), np.float32)
-        return cls(symbols, flatness, predictor, length, present, living, beside, odd, factor)
+        return cls(symbols, flatness, predictor, length, present, living, odd, factor)
 
     def log_of(self, recordings: Sequence[NDArray[np.floating]]) -> Log:
         """Return a log, recordings ``[T, D]``, as symbols."""
@@ -169,8 +166,9 @@ class Model:
     def _worst(self, suspect: Mask, known: Mask, evidence: Array) -> Mask:
         """Return the suspects that none beside them exceeds."""
         worst = suspect & (evidence > _WORST * evidence[known].max())
-        counts = (self.beside >= 0) & known[self.beside]
-        others = np.where(counts, evidence[self.beside], -np.inf).max(axis=1, initial=-np.inf)
+        beside = self.predictor.beside
+        counts = (beside >= 0) & known[beside]
+        others = np.where(counts, evidence[beside], -np.inf).max(axis=1, initial=-np.inf)
         found: Mask = worst & (evidence >= others)
         return found
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from diagnostics.layout import SensorLayout
 from diagnostics.model.conditional_mean import ConditionalMean, loaded
-from diagnostics.model.record import Array, Mask
+from diagnostics.model.record import Array, Cells, Mask
 from diagnostics.model.symbols import NOTHING
 
 _GUESS = 0.002  # of a uniform distribution in any prediction: models err
@@ -91,6 +91,8 @@ class Predictor:
         living: bool ``[D]``, cells that have a load at all.
         pad: int ``[D]``, pad of each cell.
         rings: ``[D, D]`` each, the cells beside each one, by distance.
+        beside: int ``[D, k]``, cells beside each one; -1: none.
+        cell: int ``[D]``, number that is told of each cell.
         usual: ``[D, k]``, how often and how much each cell is loaded.
         mean: the conditional mean; those of the folds take turns while the model is fitted.
         network: None: not fitted yet.
@@ -99,6 +101,8 @@ class Predictor:
     living: Mask
     pad: NDArray[np.intp]
     rings: Sequence[Array]
+    beside: Cells
+    cell: Cells
     usual: Array
     mean: ConditionalMean
     network: Network | None = None
@@ -113,7 +117,9 @@ class Predictor:
         often = np.log((share + 0.002) / (1.002 - share))
         much = load.sum(axis=0) / np.maximum(on.sum(axis=0), 1)
         usual = np.stack([often, much, load.std(axis=0)], axis=1).astype(np.float32)
-        return cls(living, layout.pad_of, _rings(layout, living), usual, mean)
+        rings = _rings(layout, living)
+        cell = np.arange(layout.n_cells)
+        return cls(living, layout.pad_of, rings, layout.beside, cell, usual, mean)
 
     def inputs(self, load: Array, own: Array, first: Mask, known: Mask) -> Array:
         """Return the inputs of the network, ``[n, D, k]``.

@@ -96,6 +96,14 @@ def test_a_cell_that_is_dead_in_every_second_recording_is_told_with_these(fitted
     assert fault.recordings == tuple(range(0, 30, 2))
 
 
+def test_a_cell_that_repeats_the_one_beside_it_is_a_copy_of_it(fitted):
+    log = presses(2, 20)
+    for frames in log:
+        frames[:, 27] = frames[:, 35]
+    (fault,) = fitted.diagnose(log).faults
+    assert (fault.cells, fault.kind, fault.value) == ((27,), FaultKind.COPY, 35)
+
+
 def test_a_dead_row_is_one_fault(fitted, healthy):
     for frames in healthy:
         frames[:, 16:24] = REST

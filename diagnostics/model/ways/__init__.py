@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from diagnostics.model.ways.clamped import CLAMPED
 from diagnostics.model.ways.comes_and_goes import COMES_AND_GOES
+from diagnostics.model.ways.copies import COPIES
 from diagnostics.model.ways.floats import FLOATS
 from diagnostics.model.ways.holds import DITHERS, HOLDS
 from diagnostics.model.ways.late import LATE, LATER
 from diagnostics.model.ways.way import Way
 
-WAYS = (HOLDS, DITHERS, FLOATS, COMES_AND_GOES, LATE, LATER, CLAMPED)
+WAYS = (HOLDS, DITHERS, FLOATS, COMES_AND_GOES, LATE, LATER, CLAMPED, COPIES)
 
 __all__ = ["WAYS", "Way"]

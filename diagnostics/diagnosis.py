@@ -271,7 +271,6 @@ class SelfDiagnosis:
         self.reference_ = replace(self.reference_, loads=usual, floors=floors)
         if self.engine == "model":
             self._model = fit_model(list(healthy), layout, dead > 0, progress=progress)
-            self._model.predictor.cell = self._order
             calibrator = Calibrator.cold()
         elif self.proof_of_life:
             self.reference_ = self.reference_.with_life(healthy, layout)
@@ -615,14 +614,10 @@ class SelfDiagnosis:
             found = found.without(unused)
             causes, possible = root_causes(found, aliases, self.layout)
         probability = found.probability.copy()
-        inferred = np.zeros(self.layout.n_cells, bool)
         still = [load.of(self._order, self.layout) for load in still]
         for load in still:
             probability[list(load.cells)] = 1 - load.probability
-        for fault in causes:
-            cells = list(fault.cells)
-            probability[cells] = np.maximum(probability[cells], fault.probability or 0.0)
-            inferred[cells] = True
+        probability, inferred = _with_causes(probability, causes)
         # Noise alone is no test; nor is movement, where the reference tells how cells depend on
         # each other; nor is a line that a shorted crossing pulls.
         pulled = np.zeros_like(inferred)
@@ -819,12 +814,7 @@ class SelfDiagnosis:
         aliases, _ = find_aliasing(stream)
         of_cells = found.of(self._place)
         causes, possible = root_causes(of_cells, aliases, self.layout)
-        probability = of_cells.probability.copy()
-        blamed = np.zeros(self.layout.n_cells, bool)
-        for fault in causes:
-            cells = list(fault.cells)
-            probability[cells] = np.maximum(probability[cells], fault.probability or 0.0)
-            blamed[cells] = True
+        probability, blamed = _with_causes(of_cells.probability, causes)
         working = of_cells.alive & ~blamed
         rest = stream.scale.baseline + stream.scale.near
         evidence = {
@@ -1080,6 +1070,19 @@ class SelfDiagnosis:
             consistent[place], contradicting[place], weight[place], self.layout
         )
         return [place[group] for group in groups]
+
+
+def _with_causes(
+    probability: NDArray[np.float64], causes: Sequence[Fault]
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """Return P(faulty) ``[D]`` with the root causes, and the cells of these, bool ``[D]``."""
+    found = probability.copy()
+    blamed = np.zeros(len(found), bool)
+    for fault in causes:
+        cells = list(fault.cells)
+        found[cells] = np.maximum(found[cells], fault.probability or 0.0)
+        blamed[cells] = True
+    return found, blamed
 
 
 class _Steps(Protocol[Result]):

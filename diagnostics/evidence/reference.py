@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -215,7 +215,7 @@ def tolerance_of(recordings: Sequence[NDArray[np.float64]], layout: SensorLayout
     )
 
 
-def converter_step(recordings: Sequence[NDArray[np.float64]], layout: SensorLayout) -> float:
+def converter_step(recordings: Sequence[NDArray[Any]], layout: SensorLayout) -> float:
     """Return the smallest difference of two readings, 0 without any."""
     readings = RecordingBlocks.of(recordings)
     sample = readings.thinned(spread(np.flatnonzero(layout.present)))

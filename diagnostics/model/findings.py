@@ -9,13 +9,12 @@ from diagnostics.decision.calibration import faulty_at
 from diagnostics.decision.root_causes import REFUTED_KINDS, CellFindings
 from diagnostics.evidence.stream_state import StreamState
 from diagnostics.faults import FaultKind
-from diagnostics.model.judge import Judgement
+from diagnostics.model.judge import HELD, Judgement
 from diagnostics.model.record import Mask
 from diagnostics.model.ways import WAYS
 from diagnostics.preprocessing.levels import DOUBTED
 
 _SHOWN = 1.0  # evidence that excludes a way to fail, or suggests one
-_HELD = 3  # pieces
 _NO_READING = (FaultKind.LATE, FaultKind.COPY)  # but frames, or a cell
 
 Floats = NDArray[np.float64]
@@ -40,7 +39,7 @@ def findings(
     probability = np.where(delivers, judgement.probability, np.where(silent, 1.0, 0.0))
     faulty = np.asarray(faulty_at(np.where(silent, 0.0, probability), rate) & delivers)
     if judgement.disturbed:
-        faulty = faulty & (log.run >= _HELD)
+        faulty = faulty & (log.run >= HELD)
         probability = np.where(delivers & ~faulty, np.minimum(probability, 0.5), probability)
     faulty = faulty | silent
     moves = np.array([way.kind is not None for way in WAYS])[judgement.way]
@@ -103,11 +102,13 @@ def _value(
     """Return what is told of each cell's likeliest fault, ``[D]``."""
     found = reading.copy()
     for i, way in enumerate(WAYS):
-        if way.value is not None:
+        of_way = (judgement.way == i) & (refuted >= 0)
+        if way.value is not None and of_way.any():
             told = way.value(judgement.observed).astype(np.float64)
+            if way.kind is FaultKind.COPY and stream.order is not None:
+                told = np.where(np.isnan(told), told, stream.order[np.nan_to_num(told).astype(int)])
             if way.kind not in _NO_READING:
                 told = stream.reading(told)
-            of_way = (judgement.way == i) & (refuted >= 0)
             found[of_way] = told[of_way]
     return found
 
@@ -117,8 +118,8 @@ def _since(judgement: Judgement) -> NDArray[np.intp]:
     begins = judgement.observed.log.record.begins
     found = np.zeros(len(judgement.way), np.intp)
     for i, way in enumerate(WAYS):
-        if way.since is not None:
-            of_way = judgement.way == i
+        of_way = judgement.way == i
+        if way.since is not None and of_way.any():
             piece = way.since(judgement.observed, judgement.units)
             found[of_way] = begins[piece[of_way]]
     return found

@@ -14,12 +14,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from diagnostics.evidence.reference import converter_step
 from diagnostics.layout import SensorLayout
 from diagnostics.model.conditional_mean import ConditionalMean
 from diagnostics.model.judge import Model
 from diagnostics.model.predictor import Network, Predictor
 from diagnostics.model.record import Array, Cells, Mask, Record, frames_of_piece, record_of
-from diagnostics.model.rest import fit_rest, step_of
+from diagnostics.model.rest import fit_rest
 from diagnostics.model.symbols import (
     NOTHING,
     Flatness,
@@ -101,7 +102,7 @@ def fit_model(
     record = record_of(recordings, length)
     ranges = np.fmax.reduce(record.high) - np.fmin.reduce(record.low)
     living = present & ~dead & (ranges > _LIVES * full)
-    rest = fit_rest(record, full, step_of(recordings, present, full), layout.pad_of, living)
+    rest = fit_rest(record, full, converter_step(recordings, layout), layout.pad_of, living)
     above = rest.above(record, living)
     symbols = Symbols.fit(above, rest, living)
     load = root_load(above, rest)

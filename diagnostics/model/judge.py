@@ -32,7 +32,7 @@ from diagnostics.model.ways import WAYS, Way
 _SUSPECT = 3.0  # evidence of a fault with which a cell predicts no other
 _WORST = 0.5  # of the highest evidence: who leaves in one round
 _ROUNDS = 8
-_HELD = 3  # pieces at the end at one load: it may be stuck
+HELD = 3  # pieces at the end at one load: it may be stuck
 _PREVALENCE = 0.03
 _WEIGHS = 20.0  # cells that the usual prevalence is worth
 _ITERATIONS = 10
@@ -120,8 +120,7 @@ class Model:
     def judge(self, recordings: Sequence[NDArray[np.floating]]) -> Judgement:
         """Judge a log, recordings ``[T, D]``."""
         log = self.log_of(recordings)
-        known = self._trusted(log)
-        observed = self.observed(log, known)
+        observed = self._by_trusted(log)
         units = Units.of(observed, self.odd)
         evidence = np.stack([way.evidence(observed, units) for way in WAYS]) * self.factor
         log_odds: Floats = logit(_PREVALENCE) + _of_any(evidence, WAYS)
@@ -133,35 +132,34 @@ class Model:
             log_odds=log_odds,
             probability=probability,
             way=_likeliest(evidence),
-            known=known,
+            known=observed.known,
             observed=observed,
             units=units,
             disturbed=self._disturbed(log, probability),
         )
 
-    def _trusted(self, log: Log) -> Mask:
-        """Return who predicts the others, bool ``[D]``."""
+    def _by_trusted(self, log: Log) -> Observed:
+        """Return what those say of a log who are trusted to predict the others."""
         deciding = [i for i, way in enumerate(WAYS) if way.decides]
         ways = [WAYS[i] for i in deciding]
-        holds = (log.run >= _HELD) & (log.load[-1] > NOTHING)
+        holds = (log.run >= HELD) & (log.load[-1] > NOTHING)
         moved = log.far.copy()
-        known = log.far & ~holds & self.living
+        observed = self.observed(log, log.far & ~holds & self.living)
         for _ in range(_ROUNDS):
-            observed = self.observed(log, known)
+            known = observed.known
             units = Units.of(observed, self.odd)
             each = np.stack([way.evidence(observed, units) for way in ways])
             evidence = _of_any(each * self.factor[deciding], ways)
             suspect = known & (evidence > _SUSPECT)
             if suspect.any():
-                known = known & ~self._worst(suspect, known, evidence)
+                observed = self.observed(log, known & ~self._worst(suspect, known, evidence))
                 continue
             joins = log.received & self.living & ~moved & (evidence < 0)
             if not joins.any():
                 break
             moved |= joins
-            known = known | joins
-        found: Mask = known
-        return found
+            observed = self.observed(log, known | joins)
+        return observed
 
     def _worst(self, suspect: Mask, known: Mask, evidence: Array) -> Mask:
         """Return the suspects that none beside them exceeds."""
@@ -174,7 +172,7 @@ class Model:
 
     @staticmethod
     def _disturbed(log: Log, probability: Floats) -> float:
-        refuted = log.far & (log.run < _HELD) & (probability > 0.5)
+        refuted = log.far & (log.run < HELD) & (probability > 0.5)
         share = float(refuted.sum() / max(1, log.far.sum()))
         return share if refuted.sum() >= _FEWEST and share > _DISTURBED else 0.0
 

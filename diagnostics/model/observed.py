@@ -98,10 +98,8 @@ class Observed:
         """Return where a cell rests and nobody on its pad tells of a contact, bool ``[n, D]``: that
         nothing touches a pad is no surprise, however often something usually does."""
         log = self.log
-        pad = self.predictor.pad
-        of_pad = np.equal(pad[:, None], np.arange(pad.max() + 1))
         witnesses = (log.load > NOTHING) & self.known
-        touched = (witnesses.astype(np.float32) @ of_pad.astype(np.float32) > 0)[:, pad]
+        touched = self.predictor.on_pad(witnesses.astype(np.float32)) > 0
         found: Mask = (log.level == 0) & ~touched
         return found
 

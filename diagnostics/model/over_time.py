@@ -11,7 +11,7 @@ more in a unit in which many cells are odd: then the whole array does what the r
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -110,8 +110,8 @@ def now_and_then(ratio: Array, units: Units) -> Array:
     """Return the evidence ``[D]`` of a fault that comes and goes: a two-state Markov chain over the
     units (forward algorithm, Rabiner 1989)."""
     # a healthy cell that is odd now and then is what this fault looks like
-    odd = np.maximum(units.odd, USUAL)
-    likelihood = np.exp(_bounded(np.add.reduceat(ratio, units.begins, axis=0), odd))
+    doubted = replace(units, odd=np.maximum(units.odd, USUAL))
+    likelihood = np.exp(doubted.of_units(ratio))
     gone = np.full(ratio.shape[1], _FAILS / (_FAILS + _RECOVERS))
     total: Array = np.zeros(ratio.shape[1], np.float32)
     for unit in likelihood:

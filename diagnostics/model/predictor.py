@@ -92,7 +92,6 @@ class Predictor:
         pad: int ``[D]``, pad of each cell.
         rings: ``[D, D]`` each, the cells beside each one, by distance.
         beside: int ``[D, k]``, cells beside each one; -1: none.
-        cell: int ``[D]``, number that is told of each cell.
         usual: ``[D, k]``, how often and how much each cell is loaded.
         mean: the conditional mean; those of the folds take turns while the model is fitted.
         network: None: not fitted yet.
@@ -102,7 +101,6 @@ class Predictor:
     pad: NDArray[np.intp]
     rings: Sequence[Array]
     beside: Cells
-    cell: Cells
     usual: Array
     mean: ConditionalMean
     network: Network | None = None
@@ -118,8 +116,7 @@ class Predictor:
         much = load.sum(axis=0) / np.maximum(on.sum(axis=0), 1)
         usual = np.stack([often, much, load.std(axis=0)], axis=1).astype(np.float32)
         rings = _rings(layout, living)
-        cell = np.arange(layout.n_cells)
-        return cls(living, layout.pad_of, rings, layout.beside, cell, usual, mean)
+        return cls(living, layout.pad_of, rings, layout.beside, usual, mean)
 
     def inputs(self, load: Array, own: Array, first: Mask, known: Mask) -> Array:
         """Return the inputs of the network, ``[n, D, k]``.
@@ -142,15 +139,20 @@ class Predictor:
             count = np.maximum(telling @ ring, 1)
             columns += [told @ ring / count, on @ ring / count]
         columns.append(np.broadcast_to(np.minimum(telling @ self.rings[0], 4), (n, d)))
-        of_pad = np.equal(self.pad[:, None], np.arange(self.pad.max() + 1)).astype(np.float32)
-        count = np.maximum(telling @ of_pad, 1)
-        columns += [(told @ of_pad / count)[:, self.pad], (on @ of_pad / count)[:, self.pad]]
+        count = np.maximum(self.on_pad(telling), 1)
+        columns += [self.on_pad(told) / count, self.on_pad(on) / count]
         columns.append(np.broadcast_to(told.mean(axis=1, keepdims=True), (n, d)))
         columns += [np.broadcast_to(one, (n, d)) for one in self.usual.T]
         last = _before(own, first)
         columns += [last, loaded(last), _before(mean, first), _before(surely, first)]
         columns.append(np.broadcast_to(first[:, None], (n, d)))
         return np.stack(columns, axis=-1).astype(np.float32)
+
+    def on_pad(self, values: Array) -> Array:
+        """Return the sum of values ``[..., D]`` over the pad of each cell, ``[..., D]``."""
+        of_pad = np.equal(self.pad[:, None], np.arange(self.pad.max() + 1)).astype(np.float32)
+        found: Array = (values @ of_pad)[..., self.pad]
+        return found
 
     def __call__(self, load: Array, own: Array, first: Mask, known: Mask) -> Array:
         """Return P(level) ``[n, D, K]``; arguments as for :meth:`inputs`."""

@@ -18,7 +18,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from diagnostics.model.record import Array, Cells, Mask, Record
 
@@ -113,11 +112,3 @@ def shortest_half(values: Array) -> tuple[Array, Array]:
     row = np.arange(len(values))
     middle = (ordered[row, at] + ordered[row, at + half]) / 2
     return middle, widths[row, at]
-
-
-def step_of(recordings: list[NDArray[np.floating]], present: Mask, full: float) -> float:
-    """Return the step of the converter: the smallest usual difference of two readings."""
-    sample = np.concatenate([one[:: max(1, len(one) // 20), present] for one in recordings])
-    gaps = np.diff(np.unique(sample[np.isfinite(sample)]))
-    gaps = gaps[gaps > 1e-6 * full]
-    return float(np.quantile(gaps, 0.05)) if len(gaps) else 0.0

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.special import expit
 
 from diagnostics.preprocessing.levels import CERTAIN_RATIO, FEWEST, MAJORITY, SUSPICIOUS
+from diagnostics.preprocessing.quantiles import known_quantile
 from diagnostics.when.mixture import QUIET_LEVELS, Found, Mixture, Symbol
 from diagnostics.when.spans import Spans
 
@@ -207,13 +208,13 @@ class _Search:
         longer. One that hardly ever moves has no value that is known to be its rest.
         """
         moves = self._moved & self._known
-        rest = _medians(np.where(moves, self._spans.low, np.nan), axis=0)
+        rest = known_quantile(np.where(moves, self._spans.low, np.nan), 0.5, axis=0)
         rest[moves.sum(axis=0) < _WITNESSES] = np.nan
         away = self._spans.middles - rest
         still = np.where(self._moved | ~self._known, np.nan, away)
         for pad in range(layout.pads):
             of_pad = layout.pad_of == pad
-            away[:, of_pad] -= np.nan_to_num(_medians(still[:, of_pad], axis=1))[:, None]
+            away[:, of_pad] -= np.nan_to_num(known_quantile(still[:, of_pad], 0.5, axis=1))[:, None]
         elsewhere = np.abs(away) > 4 * self._tolerance
         held = np.where(elsewhere, Symbol.HELD, Symbol.RESTED)
         exactly = np.where(elsewhere, Symbol.HELD_EXACTLY, Symbol.RESTED_EXACTLY)
@@ -292,13 +293,3 @@ def _lines(layout: SensorLayout) -> tuple[Floats, Floats]:
     if not on:
         return np.zeros((0, layout.n_cells)), np.zeros((0, layout.n_cells))
     return np.stack(on), np.stack(near)
-
-
-def _medians(values: Floats, axis: int) -> Floats:
-    """Return medians of what is known; NaN without any."""
-    known = np.isfinite(values).any(axis=axis)
-    found = np.full(known.shape, np.nan)
-    some = np.compress(known, values, axis=1 - axis)
-    if some.size:
-        found[known] = np.nanmedian(some, axis=axis)
-    return found

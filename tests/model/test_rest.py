@@ -4,8 +4,10 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
+from diagnostics import SensorLayout
+from diagnostics.evidence.reference import converter_step
 from diagnostics.model.record import record_of
-from diagnostics.model.rest import fit_rest, shortest_half, step_of
+from diagnostics.model.rest import fit_rest, shortest_half
 
 PAD = np.repeat([0, 1], 12)
 
@@ -48,4 +50,4 @@ def test_a_pad_that_sags_as_a_whole_is_told_by_how_much_and_the_other_is_not():
 
 def test_the_step_of_the_converter_is_the_smallest_usual_difference():
     readings = [(np.arange(200) % 13 * 4.0)[:, None]]
-    assert step_of(readings, np.ones(1, bool), 100.0) == 4.0
+    assert converter_step(readings, SensorLayout(1, 1, 1, full_scale=100.0)) == 4.0

@@ -76,9 +76,8 @@ def _source(observed: Observed) -> Array:
     odd = np.full(observed.log.level.shape[1], USUAL, np.float32)
     each, sources = _each(observed, Units.of(observed, odd))
     best = each.argmax(axis=0)
-    source = sources[best, np.arange(len(best))]
-    cell = observed.predictor.cell[source].astype(np.float32)
-    return np.where(source < 0, np.float32(np.nan), cell)
+    source = sources[best, np.arange(len(best))].astype(np.float32)
+    return np.where(source < 0, np.float32(np.nan), source)
 
 
 COPIES = Way(FaultKind.COPY, 0.05, _evidence, value=_source, decides=False)

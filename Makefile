@@ -10,8 +10,11 @@
 PYTHON ?= $(shell for p in python3.11 /usr/bin/python3.11 python3.12 python3.13 python3.10 python3; do \
 	$$p -c 'import ensurepip, venv, sys; sys.exit(sys.version_info < (3, 10))' >/dev/null 2>&1 && echo $$p && break; done)
 BIN := .venv/bin
+INSTALL = $(BIN)/python -m pip install --quiet --no-compile --disable-pip-version-check
+CONSTRAINTS := -c constraints.txt
+PACKAGES := $(wildcard packages/*)
 
-.PHONY: demo test test-all test-cpus check quick-tests all-tests examples benchmark docs wheel-check test-pythons format clean
+.PHONY: demo test test-all test-cpus check quick-tests all-tests examples benchmark docs wheel-check test-pythons install-dev format clean
 
 demo: .venv/installed
 	$(BIN)/adaptfault demo
@@ -62,6 +65,7 @@ docs: .venv/installed-docs
 wheel-check: .venv/installed-dev
 	rm -rf dist
 	$(BIN)/python -m build --outdir dist .
+	for package in $(PACKAGES); do $(BIN)/python -m build --wheel --outdir dist $$package || exit 1; done
 	$(BIN)/python tests/check_wheel.py dist
 
 # With the newest of all packages, on each other Python that is found and runs. On Linux torch brings 6 GB for each.
@@ -70,7 +74,7 @@ test-pythons:
 		version=$$($$python -c 'import ensurepip, sys; print("%d.%d" % sys.version_info[:2])' 2>/dev/null) || continue; \
 		test -e .venv-$$version/tested && continue; echo "Python $$version ($$python)"; \
 		$$python -m venv .venv-$$version && \
-		.venv-$$version/bin/python -m pip install --quiet --disable-pip-version-check -e '.[dev]' && \
+		$(MAKE) --no-print-directory BIN=.venv-$$version/bin CONSTRAINTS= install-dev && \
 		$(MAKE) --no-print-directory BIN=.venv-$$version/bin quick-tests && \
 		touch .venv-$$version/tested || exit 1; \
 	done; rm -f .venv-*/tested
@@ -79,19 +83,23 @@ format: .venv/installed-dev
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-.venv/installed: pyproject.toml constraints.txt
+.venv/installed: pyproject.toml constraints.txt $(PACKAGES:=/pyproject.toml)
 	@echo 'installing into .venv (torch is large: a minute or more)'
 	@test -n "$(PYTHON)" || { echo "make: no working python3 (3.10 to 3.13) with venv found; name one: make PYTHON=/path/to/python3 ..."; exit 1; }
 	$(BIN)/python -m pip --version >/dev/null 2>&1 || $(PYTHON) -m venv --clear .venv  # also where it was cut off
-	$(BIN)/python -m pip install --quiet --no-compile --disable-pip-version-check -c constraints.txt -e .
+	$(INSTALL) $(CONSTRAINTS) -e . $(PACKAGES:%=-e ./%)
 	@touch $@
 
 .venv/installed-dev: .venv/installed
-	$(BIN)/python -m pip install --quiet --no-compile --disable-pip-version-check -c constraints.txt -e '.[dev]'
+	@$(MAKE) --no-print-directory install-dev
 	@touch $@
 
+install-dev:
+	$(INSTALL) $(CONSTRAINTS) -e '.[dev]' -e './packages/adaptfault-bench[mujoco]' -e ./packages/adaptfault-paper \
+		-e ./packages/adaptfault-prognosis -e './packages/adaptfault-station[ros2]'
+
 .venv/installed-docs: .venv/installed
-	$(BIN)/python -m pip install --quiet --no-compile --disable-pip-version-check -c constraints.txt -e '.[docs]'
+	$(INSTALL) $(CONSTRAINTS) -e '.[docs]'
 	@touch $@
 
 clean:

@@ -7,11 +7,15 @@ model.
 from __future__ import annotations
 
 from importlib import import_module
+from pkgutil import extend_path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from adaptfault.acquisition import NotAuthentic, Receiver, Recorder, Station, read_key
-    from adaptfault.acquisition.ros import diagnostic_array, write_diagnostics
+    from adaptfault.acquisition import NotAuthentic as NotAuthentic
+    from adaptfault.acquisition import Receiver as Receiver
+    from adaptfault.acquisition import Recorder as Recorder
+    from adaptfault.acquisition import Station as Station
+    from adaptfault.acquisition import read_key as read_key
     from adaptfault.adaptation.adapter import Adapter
     from adaptfault.adaptation.adapter_files import load_adapter, save_adapter
     from adaptfault.adaptation.baselines.correction import CausalCorrection, correct
@@ -51,9 +55,11 @@ if TYPE_CHECKING:
     from adaptfault.prediction.predictor import Predictor, Reading
     from adaptfault.robot.maintenance import maintain
     from adaptfault.robot.maintenance_report import MaintenanceReport
+    from adaptfault.robot.ros_diagnostics import diagnostic_array, write_diagnostics
     from adaptfault.robot.routine import Routine
     from adaptfault.robot.selftest import plan_selftest
 
+__path__ = extend_path(__path__, __name__)  # the packages of the repository add rooms
 __version__ = "0.1.0"
 
 __all__ = [
@@ -73,18 +79,14 @@ __all__ = [
     "Inference",
     "Inspection",
     "MaintenanceReport",
-    "NotAuthentic",
     "Predictor",
     "Reading",
-    "Receiver",
-    "Recorder",
     "Recordings",
     "ReducedModel",
     "Restorer",
     "Routine",
     "Scores",
     "Sensitivity",
-    "Station",
     "Summary",
     "TactileTransformer",
     "Untrusted",
@@ -108,7 +110,6 @@ __all__ = [
     "maintain_fleet",
     "make_windows",
     "plan_selftest",
-    "read_key",
     "save",
     "save_adapter",
     "save_model",
@@ -165,7 +166,7 @@ _HOMES = {
     "analyse": "evaluation.sensitivity",
     "build_model": "models.builders",
     "correct": "adaptation.baselines.correction",
-    "diagnostic_array": "acquisition.ros",
+    "diagnostic_array": "robot.ros_diagnostics",
     "evaluate": "evaluation.scores",
     "inspect": "inspection.inspection",
     "load": "data.recordings",
@@ -189,14 +190,22 @@ _HOMES = {
     "train": "models.training",
     "train_fault_aware": "adaptation.baselines.fault_aware",
     "worst_faults": "adaptation.worst",
-    "write_diagnostics": "acquisition.ros",
+    "write_diagnostics": "robot.ros_diagnostics",
 }
 
 
 def __getattr__(name: str) -> Any:
     if name not in _HOMES:
         raise AttributeError(f"module 'adaptfault' has no attribute {name!r}")
-    return getattr(import_module(f"adaptfault.{_HOMES[name]}"), name)
+    try:
+        return getattr(import_module(f"adaptfault.{_HOMES[name]}"), name)
+    except ModuleNotFoundError as error:
+        from adaptfault.data.plugins import what_to_install
+
+        what = what_to_install(error)
+        if what is None:
+            raise
+        raise ImportError(f"adaptfault.{name}: {what}") from None
 
 
 def __dir__() -> list[str]:

@@ -4,6 +4,10 @@ Needs numpy, scipy, statsmodels and scikit-learn; never torch, so that a robot c
 without it.
 """
 
+from pkgutil import extend_path
+
+__path__ = extend_path(__path__, __name__)  # adaptfault-bench adds the circuit
+
 from diagnostics.decision.certificate import Certificate
 from diagnostics.decision.coverage import Coverage
 from diagnostics.decision.result import Diagnosis, Verdict

@@ -86,11 +86,17 @@ def missing_names(app: Sphinx, env: BuildEnvironment) -> None:
     errors."""
     documented = env.get_domain("py").objects
     for package in PUBLIC:
-        for name in importlib.import_module(package).__all__:
+        for name in names_of(package):
             if f"{package}.{name}" not in documented:
                 logging.getLogger(__name__).warning(
                     "%s.%s is public, but on no page of docs/api", package, name
                 )
+
+
+def names_of(package: str) -> list[str]:
+    """Return the public names of a package, with those that other packages bring."""
+    module = importlib.import_module(package)
+    return sorted({*module.__all__, *getattr(module, "_HOMES", ())})
 
 
 def public_name(
@@ -125,8 +131,11 @@ def described_elsewhere(
 @cache
 def public_things() -> tuple[Any, ...]:
     """Return the objects behind the public names."""
-    packages = [importlib.import_module(name) for name in PUBLIC]
-    return tuple(getattr(package, name) for package in packages for name in package.__all__)
+    return tuple(
+        getattr(importlib.import_module(package), name)
+        for package in PUBLIC
+        for name in names_of(package)
+    )
 
 
 def public_names(
@@ -135,7 +144,9 @@ def public_names(
     """Link a module's page to its public names, which are described elsewhere."""
     for package in PUBLIC if what == "module" and name not in PUBLIC else ():
         there = importlib.import_module(package)
-        names = [n for n in there.__all__ if getattr(getattr(there, n), "__module__", None) == name]
+        names = [
+            n for n in names_of(package) if getattr(getattr(there, n), "__module__", None) == name
+        ]
         if names:
             lines += [
                 "",

@@ -2,9 +2,9 @@
 
 Two opposing pads of 11 x 10 cells close on twelve objects: balls, boxes, cylinders, a capsule,
 ellipsoids, some of them soft. Contact, friction and motion are MuJoCo's (``pip install
-'adaptfault[bench]'``). Its own sensors do not give newtons a cell: ``touch_grid`` sorts contact
-points into angles, and ``tactile`` gives depths at the vertices of a mesh. A cell is therefore a
-dome of its own on the pad, and reads the normal force that the solver puts on it.
+'adaptfault-bench[mujoco]'``). Its own sensors do not give newtons a cell: ``touch_grid`` sorts
+contact points into angles, and ``tactile`` gives depths at the vertices of a mesh. A cell is
+therefore a dome of its own on the pad, and reads the normal force that the solver puts on it.
 
 - A dome is a spring of ``CELL`` newtons a metre, in series with that of the object.
 - The pads are coupled, and driven by one force, which rises to the grip force and trembles.

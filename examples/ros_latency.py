@@ -116,7 +116,7 @@ def main() -> int:
     try:
         import rclpy  # noqa: F401
     except ImportError as error:
-        print(f"no ROS 2 here ({error}): pip install 'adaptfault[ros2]' on Python 3.11")
+        print(f"no ROS 2 here ({error}): pip install 'adaptfault-station[ros2]' on Python 3.11")
         return 0
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
     in_order = []

@@ -1,8 +1,8 @@
-"""Installs the wheel where there is nothing else, and uses it from another folder: python
+"""Installs the wheels where there is nothing else, and uses them from another folder: python
 tests/check_wheel.py dist
 
-Not a test of pytest's: it takes minutes, and pip has to fetch what the package needs.
-``make wheel-check`` runs it.
+First the core alone, then the packages of ``packages/`` beside it. Not a test of pytest's: it takes
+minutes, and pip has to fetch what the packages need. ``make wheel-check`` runs it.
 """
 
 from __future__ import annotations
@@ -14,11 +14,12 @@ import tempfile
 import time
 import venv
 import zipfile
+from collections.abc import Iterable
 from pathlib import Path
 
 HOME = Path(__file__).resolve().parents[1]
-PACKAGES = ("adaptfault", "diagnostics")
-USE = """
+ROOMS = ("adaptfault", "diagnostics")
+CORE = """
 import sys, adaptfault, diagnostics
 for package in (adaptfault, diagnostics):
     assert package.__file__.startswith(sys.prefix), package.__file__
@@ -26,66 +27,118 @@ for package in (adaptfault, diagnostics):
         getattr(package, name)
 print(f"{len(adaptfault.__all__) + len(diagnostics.__all__)} public names, all there")
 """
+ALONE = """
+import adaptfault
+try:
+    adaptfault.Station
+except ImportError as error:
+    assert "pip install adaptfault-station" in str(error), error
+else:
+    raise AssertionError("the core brings a station")
+"""
+BESIDE = """
+import sys, adaptfault, adaptfault.bench, adaptfault.paper, adaptfault.prognosis, adaptfault.ros2
+import diagnostics.simulation.circuit as circuit
+for package in (adaptfault.bench, circuit, sys.modules[adaptfault.Station.__module__]):
+    assert package.__file__.startswith(sys.prefix), package.__file__
+"""
+APART = {
+    "listen": "adaptfault-station",
+    "reproduce": "adaptfault-paper",
+    "fleet survival": "adaptfault-prognosis",
+}
+"""The package that brings a command."""
 ROUNDS = 5  # of each start that is timed; the best counts
+BAD_INPUT = 3
 
 
-def left_out(wheel: Path) -> set[str]:
+def left_out(wheel: Path, source: Path) -> set[str]:
     """Return the files of the packages that the wheel lacks: templates and py.typed go missing
     easily."""
-    files = (path for package in PACKAGES for path in (HOME / package).rglob("*"))
+    files = (path for room in ROOMS for path in (source / room).rglob("*"))
     wanted = {
-        str(p.relative_to(HOME)) for p in files if p.is_file() and "__pycache__" not in p.parts
+        str(p.relative_to(source)) for p in files if p.is_file() and "__pycache__" not in p.parts
     }
     return wanted - set(zipfile.ZipFile(wheel).namelist())
 
 
-def main(dist: Path) -> None:
-    (wheel,) = dist.resolve().glob("adaptfault-*.whl")
-    if missing := left_out(wheel):
+def wheel_of(source: Path, dist: Path) -> Path:
+    """Return the wheel of a package, after a look for every file of it."""
+    name = "adaptfault" if source == HOME else source.name.replace("-", "_")
+    (wheel,) = dist.glob(f"{name}-*.whl")
+    if missing := left_out(wheel, source):
         sys.exit(f"{wheel.name} lacks {', '.join(sorted(missing))}")
-    print(
-        f"{wheel.name}: {wheel.stat().st_size / 1e3:.0f} kB, every file of {' and '.join(PACKAGES)}"
-        " is in it"
-    )
-    environment = {
-        name: value
-        for name, value in os.environ.items()
-        if not name.startswith(("PYTHON", "VIRTUAL_ENV"))
-    }
-    with tempfile.TemporaryDirectory() as folder:
-        elsewhere = Path(folder, "elsewhere")
-        elsewhere.mkdir()
-        venv.create(Path(folder, "empty"), with_pip=True)
-        python = Path(folder, "empty", "bin", "python")
+    print(f"{wheel.name}: {wheel.stat().st_size / 1e3:.0f} kB, every file is in it")
+    return wheel
 
-        def run(*command: str | Path, quiet: bool = False) -> float:
-            began = time.perf_counter()
-            out = subprocess.DEVNULL if quiet else None
-            subprocess.run(command, cwd=elsewhere, env=environment, stdout=out, check=True)
-            return time.perf_counter() - began
 
-        def pip(*arguments: str | Path) -> None:
-            run(python, "-m", "pip", "--quiet", "--disable-pip-version-check", *arguments)
+class Elsewhere:
+    """An empty environment, and a folder that is not the repository's."""
 
-        print("installing it into an empty environment (torch is large)", flush=True)
-        pip("install", "-c", HOME / "constraints.txt", wheel)
-        pip("check")
-        run(python, "-c", USE)
-        adaptfault = python.with_name("adaptfault")
-        for start in (
-            [adaptfault, "--help"],
-            [python, "-c", "import adaptfault"],
-            [python, "-c", "import diagnostics"],
-        ):
-            best = min(run(*start, quiet=True) for _ in range(ROUNDS))
-            print(
-                f"{best:.2f} s, the best of {ROUNDS}: {start[0].name} {' '.join(start[1:])}",
-                flush=True,
-            )
-        run(adaptfault, "demo")
-        assert (
-            "data:image/png;base64," in (elsewhere / "adaptfault-demo" / "report.html").read_text()
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder / "elsewhere"
+        self.folder.mkdir()
+        venv.create(folder / "empty", with_pip=True)
+        self.python = folder / "empty" / "bin" / "python"
+        self.adaptfault = self.python.with_name("adaptfault")
+        self.environment = {
+            name: value
+            for name, value in os.environ.items()
+            if not name.startswith(("PYTHON", "VIRTUAL_ENV"))
+        }
+
+    def run(self, *command: str | Path, quiet: bool = False) -> float:
+        """Run a command that has to succeed; returns its seconds."""
+        began = time.perf_counter()
+        out = subprocess.DEVNULL if quiet else None
+        subprocess.run(command, cwd=self.folder, env=self.environment, stdout=out, check=True)
+        return time.perf_counter() - began
+
+    def install(self, wheels: Iterable[Path]) -> None:
+        """Install wheels, and let pip look for conflicts."""
+        pip = [self.python, "-m", "pip", "--quiet", "--disable-pip-version-check"]
+        self.run(*pip, "install", "-c", HOME / "constraints.txt", *wheels)
+        self.run(*pip, "check")
+
+    def told(self, command: str) -> str:
+        """Return what a command writes that finds its package missing."""
+        words = [self.adaptfault, *command.split(), HOME / "README.md"]
+        done = subprocess.run(
+            words, cwd=self.folder, env=self.environment, capture_output=True, text=True
         )
+        assert done.returncode == BAD_INPUT, done
+        return done.stderr
+
+
+def main(dist: Path) -> None:
+    core = wheel_of(HOME, dist.resolve())
+    others = [wheel_of(source, dist.resolve()) for source in sorted(HOME.glob("packages/*"))]
+    with tempfile.TemporaryDirectory() as folder:
+        elsewhere = Elsewhere(Path(folder))
+        print("installing the core into an empty environment (torch is large)", flush=True)
+        elsewhere.install([core])
+        elsewhere.run(elsewhere.python, "-c", CORE)
+        elsewhere.run(elsewhere.python, "-c", ALONE)
+        for command, package in APART.items():
+            (line,) = elsewhere.told(command).splitlines()
+            assert f"pip install {package}" in line, line
+        for start in (
+            [elsewhere.adaptfault, "--help"],
+            [elsewhere.python, "-c", "import adaptfault"],
+            [elsewhere.python, "-c", "import diagnostics"],
+        ):
+            best = min(elsewhere.run(*start, quiet=True) for _ in range(ROUNDS))
+            what = f"{start[0].name} {' '.join(start[1:])}"
+            print(f"{best:.2f} s, the best of {ROUNDS}: {what}", flush=True)
+        elsewhere.run(elsewhere.adaptfault, "demo")
+        report = elsewhere.folder / "adaptfault-demo" / "report.html"
+        assert "data:image/png;base64," in report.read_text()
+        elsewhere.install(others)
+        elsewhere.run(elsewhere.python, "-c", CORE)
+        elsewhere.run(elsewhere.python, "-c", BESIDE)
+        for command in APART:
+            elsewhere.run(elsewhere.adaptfault, *command.split(), "--help", quiet=True)
+        print(f"{len(others)} packages beside it, their commands all there")
 
 
 if __name__ == "__main__":

@@ -55,8 +55,9 @@ class Entry:
         what: "deployed", "unchanged", "kept", "refused", "confirmed" or "rollback".
         document: JSON-safe.
         recordings: ``(digest, name)`` of those that the run used.
-        condition: of the cells, as :mod:`adaptfault.prognosis.cell_condition` encodes it; None:
-            no row.
+        condition: of the D cells, 9 bytes each: ``[4, D]`` of
+            :class:`~diagnostics.sensor.ageing.CellCondition` as little-endian float16, then the
+            verdicts ``[D]`` as int8; None: no row.
         key: identifies the entry, so that it is journalled once.
     """
 

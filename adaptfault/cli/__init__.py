@@ -9,14 +9,17 @@ import math
 import sys
 import traceback
 from collections.abc import Callable, Sequence
+from pkgutil import extend_path
 from typing import Any, NoReturn
 
 from adaptfault import __version__
 from adaptfault.cli.options import LogAboveBars
 from adaptfault.cli.paths import check_paths
 from adaptfault.cli.streams import finish, is_unread, one_line, prepare, settle
-from adaptfault.data.plugins import plugins
+from adaptfault.data.plugins import plugins, what_to_install
 from adaptfault.data.shortage import is_shortage
+
+__path__ = extend_path(__path__, __name__)  # the packages of the repository add commands
 
 GROUP = "adaptfault.commands"
 
@@ -43,7 +46,7 @@ BUILT_IN = {
     "fleet": "adaptfault.cli.fleet",
     "reproduce": "adaptfault.cli.reproduce",
 }
-"""The commands in the order of ``--help``, as the entry points of this package name them. Another
+"""The commands in the order of ``--help``, as the entry points of the repository name them. Another
 package adds one by a module with ``add(subparsers)`` and an entry point in the same group."""
 
 # exit code for unusable input or usage, as monitoring tools understand it ("unknown")
@@ -116,11 +119,12 @@ def _failed(args: argparse.Namespace, error: Exception) -> int:
     """
     if is_unread(error):
         return 0
-    if isinstance(error, ValueError | OSError) or is_shortage(error):
-        print(f"adaptfault {args.command}: error: {one_line(error)}", file=sys.stderr)
-        return BAD_INPUT
+    what = what_to_install(error)
     if isinstance(error, RecursionError):
         what = "what it reads nests too deep; check the files that were given"
+    elif isinstance(error, ValueError | OSError) or is_shortage(error):
+        what = one_line(error)
+    if what is not None:
         print(f"adaptfault {args.command}: error: {what}", file=sys.stderr)
         return BAD_INPUT
     traceback.print_exception(error)

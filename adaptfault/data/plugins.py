@@ -1,21 +1,40 @@
-"""Parts that other packages may add through entry points; those of this package are found without
-an installation, too."""
+"""Parts that other packages may add through entry points, and those that are installed on their
+own."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from importlib import import_module
 from importlib.metadata import entry_points
 from typing import Any
 
+APART = {
+    "adaptfault.acquisition": "adaptfault-station",
+    "adaptfault.cli.listen": "adaptfault-station",
+    "adaptfault.cli.reproduce": "adaptfault-paper",
+    "adaptfault.prognosis": "adaptfault-prognosis",
+}
+"""The package that brings a module, where it is installed on its own."""
+
+
+def what_to_install(error: BaseException) -> str | None:
+    """Return one line that says which package is missing; None: it is another error."""
+    package = APART.get(error.name or "") if isinstance(error, ModuleNotFoundError) else None
+    if package is None:
+        return None
+    return f"this needs {package}, which is not installed: pip install {package}"
+
 
 def plugins(group: str, built_in: Mapping[str, str]) -> dict[str, Any]:
-    """Return what is registered in an entry point group, by its name.
+    """Return what is registered in an entry point group, by its name; an :class:`Apart` stands for
+    what is not installed.
 
     Args:
         group: of the entry points.
-        built_in: module of each part of this package, in the order wanted. Another package replaces
-            one by an entry point of the same name; its own parts come behind.
+        built_in: module of each part of the repository, in the order wanted; they are found without
+            their entry points, too. Another package replaces one by an entry point of the same
+            name; its own parts come behind.
 
     Raises:
         ImportError: a part cannot be imported.
@@ -25,7 +44,41 @@ def plugins(group: str, built_in: Mapping[str, str]) -> dict[str, Any]:
         for entry in entry_points(group=group)
         if built_in.get(entry.name) != entry.value
     }
-    found = {name: import_module(module) for name, module in built_in.items() if name not in others}
-    loaded = {name: entry.load() for name, entry in others.items()}
-    order = [*built_in, *(name for name in others if name not in built_in)]
-    return {name: found.get(name, loaded.get(name)) for name in order}
+    found: dict[str, Any] = dict.fromkeys(built_in)
+    for name, module in built_in.items():
+        if name not in others:
+            found[name] = _part(name, module)
+    for name, entry in others.items():
+        found[name] = entry.load()
+    return found
+
+
+def _part(name: str, module: str) -> Any:
+    try:
+        return import_module(module)
+    except ModuleNotFoundError as error:
+        if error.name != module or module not in APART:
+            raise
+        return Apart(name, module)
+
+
+@dataclass(frozen=True)
+class Apart:
+    """A command of a package that is not installed: it takes any arguments and says what to
+    install."""
+
+    name: str
+    module: str
+
+    def add(self, commands: Any) -> None:
+        """Add the command."""
+        summary = f"needs: pip install {APART[self.module]}"
+        # no argument begins with this character, so that each is taken as it is
+        parser = commands.add_parser(self.name, help=summary, add_help=False, prefix_chars="\0")
+        parser.add_argument("arguments", nargs="*")
+        parser.set_defaults(run=self.run)
+
+    def run(self, args: Any) -> int:
+        """Raise ModuleNotFoundError."""
+        import_module(self.module)
+        return 0

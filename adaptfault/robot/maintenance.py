@@ -30,7 +30,6 @@ from adaptfault.inspection.severity import (
     of_change,
     of_known,
 )
-from adaptfault.prognosis.cell_condition import encode
 from adaptfault.robot.maintenance_report import Decision, MaintenanceReport
 from adaptfault.robot.maintenance_run import MaintenanceRun, Robot
 from adaptfault.robot.model_comparison import Judgement, compare_candidate, score, with_faults
@@ -553,12 +552,13 @@ def _changed(robot: Robot, change: SensorChange, x: NDArray[np.float32]) -> NDAr
 
 
 def _condition(run: MaintenanceRun, readings: ChangedReadings) -> bytes:
-    """Return the condition of each cell, for the prognosis; see
-    :mod:`diagnostics.sensor.ageing`."""
+    """Return the row of a run, as the journal keeps it; see :mod:`diagnostics.sensor.ageing`."""
     robot = run.robot
     loads = as_loads(robot.diagnoser, readings.frames)
     healthy = as_loads(robot.diagnoser, robot.healthy)
-    return encode(cell_condition(loads, healthy, robot.layout), readings.diagnosis.verdicts)
+    condition = cell_condition(loads, healthy, robot.layout)
+    verdicts = readings.diagnosis.verdicts.astype(np.int8)
+    return condition.values.astype("<f2").tobytes() + verdicts.tobytes()
 
 
 def _write(

@@ -22,9 +22,9 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptfault.acquisition.ros import TOPIC, diagnostic_array
 from adaptfault.data.atomic import atomic_file
 from adaptfault.data.recordings.formats.datasets.extra import imported
+from adaptfault.robot.ros_diagnostics import TOPIC, diagnostic_array
 from adaptfault.viewers.timed_log import COLOURS, ROOT, Piece, TimedLog
 from diagnostics import SensorLayout
 
@@ -101,8 +101,8 @@ class McapMessages:
         return self._channel(self._grid, topic)
 
     def status(self, time: float, status: Mapping[str, Any]) -> None:
-        """Add a DiagnosticArray, as :func:`~adaptfault.acquisition.ros.diagnostic_array` makes it,
-        at ``time`` (seconds)."""
+        """Add a DiagnosticArray, as :func:`adaptfault.diagnostic_array` makes it, at ``time``
+        (seconds)."""
         stamp = _stamp(time)
         header = {"stamp": stamp, "frame_id": FRAME}
         self.add(self._diagnostics, stamp, {**status, "header": header})

@@ -13,7 +13,7 @@ setup(
         (f"share/{NAME}", ["package.xml"]),
         (f"share/{NAME}/launch", ["launch/tactile.launch.py"]),
     ],
-    install_requires=["setuptools", "adaptfault"],
+    install_requires=["setuptools", "adaptfault-station"],
     zip_safe=True,
     entry_points={"console_scripts": [f"node = {NAME}.node:main"]},
 )

@@ -14,10 +14,10 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
-from adaptfault.acquisition.ros import Level, diagnostic_array, stale_array, write_diagnostics
 from adaptfault.data.calibration import Calibration
 from adaptfault.data.recordings.formats.message_arrays import arrays_at, join, put
 from adaptfault.imputation.restorer import Restorer
+from adaptfault.robot.ros_diagnostics import Level, diagnostic_array, stale_array, write_diagnostics
 from adaptfault.ros2 import parameters
 from adaptfault.ros2.parameters import DEFAULTS, Parameters, quoted, unknown
 from adaptfault.ros2.rounds import Part, Rounds

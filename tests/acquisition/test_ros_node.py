@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 rclpy = pytest.importorskip(
-    "rclpy", reason="rclpy is missing: pip install 'adaptfault[ros2]'", exc_type=ImportError
+    "rclpy", reason="rclpy is missing: pip install 'adaptfault-station[ros2]'", exc_type=ImportError
 )
 
 with warnings.catch_warnings():

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from conftest import without_calibration
 
-from adaptfault.acquisition.ros import diagnostic_array, stale_array
 from adaptfault.data.simulated_grasps import simulate
+from adaptfault.robot.ros_diagnostics import diagnostic_array, stale_array
 from diagnostics import (
     Diagnosis,
     Fault,

@@ -8,7 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import adaptfault
 from adaptfault import cli
+from adaptfault.data.plugins import APART
 from adaptfault.data.recordings import readers
 
 ROOT = Path(__file__).parents[2]
@@ -71,9 +73,68 @@ def test_a_command_of_another_package_is_one_of_the_program(installed):
     assert "say hello" in run(installed, "--help").stdout
 
 
-def test_the_parts_of_this_package_are_registered_as_those_of_others():
+def projects():
     tomllib = pytest.importorskip("tomllib")
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    registered = project["entry-points"]
-    assert registered[readers.GROUP] == readers.BUILT_IN
-    assert registered[cli.GROUP] == cli.BUILT_IN
+    paths = [ROOT / "pyproject.toml", *sorted(ROOT.glob("packages/*/pyproject.toml"))]
+    return [tomllib.loads(path.read_text())["project"] for path in paths]
+
+
+@pytest.mark.parametrize("part", [readers, cli], ids=["readers", "commands"])
+def test_the_parts_of_the_repository_are_registered_as_those_of_others(part):
+    registered = {}
+    for project in projects():
+        registered |= project.get("entry-points", {}).get(part.GROUP, {})
+    assert registered == part.BUILT_IN
+
+
+def test_the_packages_of_the_repository_are_of_one_version():
+    core, *others = projects()
+    assert core["version"] == adaptfault.__version__
+    for project in others:
+        assert project["version"] == core["version"]
+        assert project["dependencies"] == [f"adaptfault=={core['version']}"]
+    assert set(APART.values()) <= {project["name"] for project in others}
+
+
+class NotInstalled:
+    def find_spec(self, name, path=None, target=None):
+        if name in APART:
+            raise ModuleNotFoundError(f"No module named {name!r}", name=name)
+
+
+@pytest.fixture
+def core_alone(monkeypatch):
+    for name in list(sys.modules):
+        if name.startswith(tuple(APART)):
+            monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setattr(sys, "meta_path", [NotInstalled(), *sys.meta_path])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "package"),
+    [
+        (["listen", "--port", "5", "--", "x"], "adaptfault-station"),
+        (["reproduce", "--quick", "--help"], "adaptfault-paper"),
+        (["fleet", "survival", "FLEET.toml"], "adaptfault-prognosis"),
+    ],
+    ids=["listen", "reproduce", "fleet survival"],
+)
+def test_a_command_of_a_package_that_is_not_installed_says_what_to_install(
+    core_alone, tmp_path, monkeypatch, capsys, arguments, package
+):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "FLEET.toml").write_text(
+        '[[robots]]\nname = "a"\nbundle = "a.bundle"\nrecordings = "a"\n'
+    )
+    assert cli.main(arguments) == 3
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line == (
+        f"adaptfault {arguments[0]}: error: this needs {package}, which is not installed:"
+        f" pip install {package}"
+    )
+
+
+def test_a_name_of_a_package_that_is_not_installed_says_what_to_install(core_alone):
+    with pytest.raises(ImportError, match="pip install adaptfault-station"):
+        getattr(adaptfault, "Station")  # noqa: B009
+    assert all(hasattr(adaptfault, name) for name in adaptfault.__all__)

@@ -20,10 +20,10 @@ import numpy as np
 import pytest
 
 from adaptfault.acquisition import FrameRepair, Session, Station, format_packet
+from adaptfault.acquisition.live import LiveView
 from adaptfault.acquisition.ordering import Frame
 from adaptfault.bundle.bundle import Bundle
 from adaptfault.cli import main
-from adaptfault.viewers.live import LiveView
 from adaptfault.viewers.mcap_file import McapMessages
 from adaptfault.viewers.timed_log import State
 from diagnostics import Monitor, SelfDiagnosis, SensorLayout

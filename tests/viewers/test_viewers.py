@@ -8,8 +8,8 @@ import sys
 import numpy as np
 import pytest
 
-from adaptfault.acquisition.ros import diagnostic_array
 from adaptfault.data.recordings import InputError
+from adaptfault.robot.ros_diagnostics import diagnostic_array
 from adaptfault.viewers.mcap_file import CELL, write_mcap
 from adaptfault.viewers.rerun_file import write_rrd
 from adaptfault.viewers.timed_log import COLOURS, State, TimedLog

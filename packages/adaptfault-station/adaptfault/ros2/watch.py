@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adaptfault.acquisition import FrameRepair
-from adaptfault.acquisition.ros import Level, diagnostic_array, stale_array
 from adaptfault.inspection.converter_range import within_range
+from adaptfault.robot.ros_diagnostics import Level, diagnostic_array, stale_array
 from adaptfault.ros2.sensor import Sensor
 from diagnostics import Fault, FaultSet, Monitor
 
@@ -37,7 +37,7 @@ class Watch:
 
     Args:
         sensor: as the bundle or the layout states it.
-        name, hardware_id: of :func:`~adaptfault.acquisition.ros.diagnostic_array`.
+        name, hardware_id: of :func:`~adaptfault.robot.ros_diagnostics.diagnostic_array`.
         clock: seconds, never set back.
     """
 

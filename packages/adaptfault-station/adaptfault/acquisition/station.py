@@ -31,9 +31,9 @@ from adaptfault.robot.metrics import RobotMetrics, cells_by_pad, fault_counts, w
 from diagnostics import FaultSet, Monitor, SelfDiagnosis, SensorLayout
 
 if TYPE_CHECKING:
+    from adaptfault.acquisition.live import LiveView
     from adaptfault.data.calibration import Calibration
     from adaptfault.imputation.restorer import Restorer
-    from adaptfault.viewers.live import LiveView
 
 SCHEMA = "adaptfault.listen/1"
 
@@ -67,7 +67,7 @@ class Station:
         metrics: file of metrics for Prometheus, written when faults change and at the end; the
             robots in it are devices.
         view: file or stream that shows all frames, see
-            :class:`~adaptfault.viewers.live.LiveView`; with a bundle, restored ones, too.
+            :class:`~adaptfault.acquisition.live.LiveView`; with a bundle, restored ones, too.
         seconds, frames: when to end; None: never.
         calibration: converts received values into the layout's unit.
         on_event: called with each event in the event loop, instead of printing it.
@@ -383,7 +383,7 @@ class Station:
         return Relay(address, restorer, known, calibration=self.calibration, ticks=ticks)
 
     def _make_view(self, target: str) -> LiveView:
-        from adaptfault.viewers.live import LiveView
+        from adaptfault.acquisition.live import LiveView
 
         repair = None
         if self.bundle is not None:

@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 
 from adaptfault.acquisition.ordering import Frame
 from adaptfault.acquisition.relay import FrameRepair
-from adaptfault.acquisition.ros import Level, diagnostic_array, stale_array
 from adaptfault.acquisition.session import Event, Session
+from adaptfault.robot.ros_diagnostics import Level, diagnostic_array, stale_array
 from adaptfault.viewers.mcap_file import McapArray, McapMessages, check_mcap
 from adaptfault.viewers.rerun_file import RerunArray, blueprint, check_rerun
 from adaptfault.viewers.timed_log import ROOT, Piece, State, on_grid, states_of

@@ -18,7 +18,7 @@ from adaptfault.inspection.severity import TECHNICIAN_BELOW
 from adaptfault.prognosis.trend import COVERAGE, FALSE, Trend, Trends, trends
 from diagnostics.decision.result import Verdict
 from diagnostics.layout import SensorLayout
-from diagnostics.sensor.ageing import STATISTICS, CellCondition
+from diagnostics.sensor.ageing import STATISTICS
 from diagnostics.shown import shown
 from diagnostics.wiring import Line
 
@@ -49,16 +49,6 @@ _PLOTTED = 8  # series in the picture
 Floats = NDArray[np.float64]
 
 
-def encode(condition: CellCondition, verdicts: NDArray[Any]) -> bytes:
-    """Return the row of a run: 9 bytes for each cell.
-
-    Args:
-        condition: of the cells.
-        verdicts: of the diagnosis, ``[D]``.
-    """
-    return condition.values.astype("<f2").tobytes() + np.asarray(verdicts).astype(np.int8).tobytes()
-
-
 @dataclass(frozen=True, eq=False)
 class AgeingTable:
     """Condition of the cells by run, oldest first.
@@ -67,7 +57,8 @@ class AgeingTable:
         layout: the array.
         runs: numbers of the n runs in the journal.
         times: of the runs, UTC, ISO 8601.
-        values: float ``[n, 4, D]``: gain, offset, noise and blinks, as :class:`CellCondition`; NaN:
+        values: float ``[n, 4, D]``: gain, offset, noise and blinks, as
+            :class:`diagnostics.sensor.ageing.CellCondition`; NaN:
             not known.
         verdicts: int ``[n, D]``, as :class:`diagnostics.Verdict`.
         accuracy: float ``[n]``, of the running version as a share of the fault-free one; NaN: not

@@ -15,7 +15,8 @@ def main() -> None:
         import rclpy  # noqa: F401
     except ImportError as error:
         mend = (
-            "source /opt/ros/<distro>/setup.bash, or on Python 3.11 pip install 'adaptfault[ros2]'"
+            "source /opt/ros/<distro>/setup.bash, or on Python 3.11 pip install"
+            " 'adaptfault-station[ros2]'"
         )
         print(f"no ROS 2 here ({error}): {mend}", file=sys.stderr)
         sys.exit(3)

@@ -201,25 +201,47 @@ class _Search:
         return Held(evidence, suspect, self._moved, value)
 
     def _symbols(self, layout: SensorLayout) -> NDArray[np.intp]:
-        """Return the symbol of each cell in each recording, ``[n, D]``.
+        """Return the symbol of each cell in each recording, ``[n, D]``."""
+        elsewhere = np.ones(self._moved.shape, bool)
+        for rest in self._rests(layout):
+            elsewhere &= self._away(rest, layout) > 4 * self._tolerance
+        held = np.where(elsewhere, Symbol.HELD, Symbol.RESTED)
+        exactly = np.where(elsewhere, Symbol.HELD_EXACTLY, Symbol.RESTED_EXACTLY)
+        still_symbol = np.where(self._exact, exactly, held)
+        return np.where(self._moved, Symbol.MOVED, still_symbol).astype(np.intp)
 
-        What all cells of a pad at rest share is no other value. A cell rests at what it reads
-        lowest in the recordings in which it moves: where it fails early, what it is stuck at lasts
-        longer. One that hardly ever moves has no value that is known to be its rest.
+    def _rests(self, layout: SensorLayout) -> list[Floats]:
+        """Return what each cell may rest at, ``[D]`` each; NaN: nothing tells.
+
+        A cell rests at what it reads lowest in the recordings in which it moves: where it fails
+        early, what it is stuck at lasts longer. One that hardly ever moves, or moves under loads
+        that never end, rests where most others of its pad do.
         """
         moves = self._moved & self._known
-        rest = known_quantile(np.where(moves, self._spans.low, np.nan), 0.5, axis=0)
-        rest[moves.sum(axis=0) < _WITNESSES] = np.nan
+        own = known_quantile(np.where(moves, self._spans.low, np.nan), 0.5, axis=0)
+        own[moves.sum(axis=0) < _WITNESSES] = np.nan
+        still = np.where(self._moved | ~self._known, np.nan, self._spans.middles)
+        usual = known_quantile(still, 0.5, axis=0)
+        of_pad = np.full(len(own), np.nan)
+        for pad in range(layout.pads):
+            on_pad = layout.pad_of == pad
+            level = known_quantile(usual[on_pad], 0.5, axis=0)
+            agree = np.abs(usual[on_pad] - level) <= 4 * self._tolerance
+            if agree.sum() > MAJORITY * np.isfinite(usual[on_pad]).sum():
+                of_pad[on_pad] = level
+        own = np.where(np.isnan(own), of_pad, own)
+        return [own, np.where(np.isnan(of_pad), own, of_pad)]
+
+    def _away(self, rest: Floats, layout: SensorLayout) -> Floats:
+        """Return how far cells hold from where they rest (``[D]``), ``[n, D]``; what all cells of
+        a pad at rest share does not count; NaN: unknown."""
         away = self._spans.middles - rest
         still = np.where(self._moved | ~self._known, np.nan, away)
         for pad in range(layout.pads):
             of_pad = layout.pad_of == pad
             away[:, of_pad] -= np.nan_to_num(known_quantile(still[:, of_pad], 0.5, axis=1))[:, None]
-        elsewhere = np.abs(away) > 4 * self._tolerance
-        held = np.where(elsewhere, Symbol.HELD, Symbol.RESTED)
-        exactly = np.where(elsewhere, Symbol.HELD_EXACTLY, Symbol.RESTED_EXACTLY)
-        still_symbol = np.where(self._exact, exactly, held)
-        return np.where(self._moved, Symbol.MOVED, still_symbol).astype(np.intp)
+        found: Floats = np.abs(away)
+        return found
 
     def _line_symbols(self) -> NDArray[np.intp]:
         """Return the symbol of each line in each recording, ``[n, lines]``."""

@@ -107,6 +107,23 @@ def test_a_row_that_dies_between_two_tasks_is_suspect_in_the_later_ones(seed):
     assert not suspect[:16].any()
 
 
+@pytest.mark.parametrize("seed", [1, 3, 12])
+def test_cells_that_hold_a_value_through_one_task_are_found_where_loads_last(seed):
+    finger = SensorLayout(1, 12, 10, full_scale=3.3)
+    made = simulate(16, finger, n_frames=60, seed=seed, classes=("nothing", "normal", "softer"))
+    tasks = np.asarray(made.labels)
+    log = [np.array(frames).reshape(60, -1) for frames in made.frames]
+    assert not find_held(Spans.of(RecordingBlocks(log)), finger, TOLERANCE, tasks).suspect.any()
+    rng = np.random.default_rng(seed)
+    cells = rng.choice(finger.n_cells, 6, replace=False)
+    where = (tasks == 2) & (rng.random(len(tasks)) < 0.94)
+    for i in np.flatnonzero(where):
+        log[i][:, cells] = 0.61
+    suspect = find_held(Spans.of(RecordingBlocks(log)), finger, TOLERANCE, tasks).suspect
+    assert suspect[np.ix_(where, cells)].mean() > 0.9
+    assert not np.delete(suspect, cells, axis=1).any()
+
+
 def test_few_recordings_say_nothing(grasps):
     assert not found(broken(grasps[:10], ROW, set(range(5)))).any()
 

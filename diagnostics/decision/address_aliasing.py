@@ -30,7 +30,7 @@ Cells = NDArray[np.intp]
 def find_aliasing(stream: StreamState) -> tuple[list[Fault], NDArray[np.bool_]]:
     """Return the causes of all lines that read the same, and the cells that are or may be misread,
     bool ``[D]``."""
-    pairs = stream.duplicates.duplicate_pairs(stream.reference.duplicates)
+    pairs = stream.duplicates.duplicate_pairs(stream.reference.duplicates.most)
     if stream.crosstalk is not None:  # lines that nothing touches read the same
         pairs = []
     faults = list[Fault]()

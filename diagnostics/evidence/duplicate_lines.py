@@ -5,9 +5,10 @@ Detects, among the pairs that one address bit or one bridge can join, those that
 tolerance in every frame while informative cells (loaded, moving, not saturated) support the
 agreement: a *coincidence*. With p the chance that two lines agree, n coincidences count n log2(1 /
 p), and at most n: models err. p is the share of the other pairs on the pad, rows and columns, that
-agreed where they could, in the same frames; what moves all cells alike is no evidence. A pair is
-found when it counts 3 more than any healthy pair, and when its difference d is white noise around
-zero, as of one cell read twice:
+agreed where they could, in the same frames; what moves all cells alike is no evidence. It is no
+less than the share of the reference in which the pair itself agreed: what presses two cells alike
+there does so in the log. A pair is found when it counts 3 more than any healthy pair, and when its
+difference d is white noise around zero, as of one cell read twice:
 
     sqrt(n) sum d_t d_{t-1} / sum d^2 <= 3
 
@@ -19,7 +20,7 @@ loads are not detected.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from itertools import pairwise
 from typing import TYPE_CHECKING, NamedTuple
@@ -108,6 +109,9 @@ class _Pairs:
             the difference, its product with the one before, and 1.
         others: int ``[2, pads, pairs]``, how many other pairs could agree when these did, and how
             many of them agreed.
+        own: int ``[2, pads, pairs]``, in how many segments these could agree, and in how many they
+            did.
+        usual: float ``[pads, pairs]``, share of these in the reference.
     """
 
     first: NDArray[np.intp]
@@ -118,17 +122,19 @@ class _Pairs:
     coincidences: NDArray[np.intp]
     sums: NDArray[np.float32]
     others: NDArray[np.intp]
+    own: NDArray[np.intp]
+    usual: NDArray[np.float64]
 
     @classmethod
-    def begin(cls, present: Mask) -> _Pairs:
+    def begin(cls, present: Mask, usual: NDArray[np.float64]) -> _Pairs:
         """Return the state before any frame, for cells ``present`` (bool
         ``[pads, lines, positions]``)."""
         first, second = np.array(pairs(present.shape[1]), dtype=np.intp).reshape(-1, 2).T
         there = present[:, first] & present[:, second]
         nothing = np.zeros(there.shape[:2], np.intp)
         sums = np.zeros((3, *nothing.shape), np.float32)
-        others = np.zeros((2, *nothing.shape), np.intp)
-        return cls(first, second, there, nothing, nothing, nothing, sums, others)
+        counts = np.zeros((2, *nothing.shape), np.intp)
+        return cls(first, second, there, nothing, nothing, nothing, sums, counts, counts, usual)
 
     def compare(
         self,
@@ -171,7 +177,9 @@ class _Pairs:
         coincidences = self.coincidences
         sums = self.sums
         others = self.others
-        agree = compared.supported & ~ever
+        supported = compared.supported
+        agree = supported & ~ever
+        own = self.own + np.stack([supported, agree])
         if agree.any() or (ever & (coincidences > 0)).any():
             coincidences = np.where(
                 ever, 0, coincidences + np.minimum(both.sum(axis=2), _MOST_AT_ONCE)
@@ -181,17 +189,22 @@ class _Pairs:
                 lines, both & ~ever[..., None], tolerance
             )
             others = np.where(ever, 0, others + agree * (totals[..., None] - 1))
-        return _Pairs(
-            self.first, self.second, self.there, since, seen_by, coincidences, sums, others
+        return replace(
+            self,
+            since=since,
+            seen_by=seen_by,
+            coincidences=coincidences,
+            sums=sums,
+            others=others,
+            own=own,
         )
 
     @property
     def chance(self) -> NDArray[np.float64]:
-        """Probability that two lines agree which are not joined (Laplace), at least 1/2,
+        """Probability that two lines agree which are not joined, at least 1/2,
         ``[pads, pairs]``."""
-        could, did = self.others
-        chance: NDArray[np.float64] = np.maximum((did + 1) / (could + 2), _LEAST_CHANCE)
-        return chance
+        chance: NDArray[np.float64] = np.maximum(agreement(self.others), self.usual)
+        return np.maximum(chance, _LEAST_CHANCE)
 
     def _summed(
         self, lines: NDArray[np.float32], both: Mask, tolerance: float
@@ -228,6 +241,14 @@ class _Pairs:
         return [(pad, i) for pad, i in np.argwhere(often & noise).tolist()]
 
 
+def agreement(counts: NDArray[np.intp]) -> NDArray[np.float64]:
+    """Return the probability that pairs agree, from how often they could and did (Laplace),
+    ``[pads, pairs]`` of ``[2, pads, pairs]``."""
+    could, did = counts
+    share: NDArray[np.float64] = (did + 1) / (could + 2)
+    return share
+
+
 @dataclass(frozen=True)
 class DuplicateLines:
     """All pairs of lines of an array.
@@ -243,15 +264,36 @@ class DuplicateLines:
     most: int = 0
 
     @classmethod
-    def begin(cls, layout: SensorLayout) -> DuplicateLines:
+    def begin(
+        cls, layout: SensorLayout, usual: NDArray[np.float64] | None = None
+    ) -> DuplicateLines:
         """Return the state before any frame. With declared wiring there are no rows and columns to
-        compare."""
-        present = layout.present
+        compare.
+
+        Args:
+            layout: the array.
+            usual: float ``[pads, pairs]``, P(a pair agrees) in the reference, rows before columns;
+                None: unknown.
+        """
         if not layout.is_matrix:
             return cls(layout, {})
+        n_rows = len(pairs(layout.rows))
+        if usual is None:
+            usual = np.zeros((layout.pads, n_rows + len(pairs(layout.cols))))
         return cls(
-            layout, {"row": _Pairs.begin(present), "column": _Pairs.begin(present.swapaxes(1, 2))}
+            layout,
+            {
+                "row": _Pairs.begin(layout.present, usual[:, :n_rows]),
+                "column": _Pairs.begin(layout.present.swapaxes(1, 2), usual[:, n_rows:]),
+            },
         )
+
+    @property
+    def agreed(self) -> NDArray[np.intp]:
+        """In how many segments each pair of rows, then of columns, could agree, and did, int
+        ``[2, pads, pairs]``."""
+        none = np.zeros((2, self.layout.pads, 0), np.intp)
+        return np.concatenate([none, *(each.own for each in self.of.values())], axis=2)
 
     def extend(
         self,

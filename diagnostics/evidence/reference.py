@@ -10,14 +10,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from diagnostics.events.constant_runs import segments
-from diagnostics.evidence.duplicate_lines import DuplicateLines, informative
 from diagnostics.evidence.intermittency import HealthyRates
 from diagnostics.evidence.jumps import JumpHistogram
 from diagnostics.evidence.life import LifeModel, fit_life
 from diagnostics.evidence.lower_limit import LowerLimit
 from diagnostics.evidence.noise_loss import NoiseLoss
 from diagnostics.evidence.pad_level import PadLimit
+from diagnostics.evidence.usual_duplicates import UsualDuplicates
 from diagnostics.healthy.model import HealthyModel
 from diagnostics.healthy.tiled_model import fit_healthy_model
 from diagnostics.preprocessing.baseline import baseline
@@ -33,8 +32,6 @@ if TYPE_CHECKING:
 
 # of full scale: half the range of a stuck cell's reading, the dither of a converter
 _TOLERANCE = 0.005
-_DUPLICATES = 5  # coincidences that two healthy lines may have, in a cold start
-_MANY = 250  # recordings after which the largest count seen is the limit; one more for each halving
 
 
 @dataclass(frozen=True)
@@ -50,7 +47,7 @@ class Reference:
         offset: common offset of all cells.
         patience: repetitions of a frame after which it carries no information.
         usual: rates of blinks and excess noise of healthy cells.
-        duplicates: coincidences that two healthy lines may have.
+        duplicates: coincidences that two healthy lines may have, and how often each pair agrees.
         model: the healthy model; None: the k-NN spatial model of the log (cold start).
         dead: float ``[D]``, P(dead) of the reference faults, 0 for all other cells.
         loaded_patience: the same of a frame with load; 0: as ``patience``.
@@ -73,7 +70,7 @@ class Reference:
     offset: ReferenceOffset
     patience: int
     usual: HealthyRates
-    duplicates: int
+    duplicates: UsualDuplicates
     model: HealthyModel | None
     dead: NDArray[np.float64]
     loaded_patience: int = 0
@@ -146,7 +143,7 @@ class Reference:
             ReferenceOffset.fit(recordings, scale, present, float(np.ptp(level))),
             patience.idle,
             HealthyRates.fit(recordings, scale, layout),
-            _usual_duplicates(recordings, layout, scale),
+            UsualDuplicates.fit(recordings, layout, scale),
             model,
             dead,
             # At another level every cell seems loaded.
@@ -185,7 +182,7 @@ class Reference:
             ReferenceOffset(0.0, tolerance),
             2 * SEGMENT,
             HealthyRates.unknown(),
-            _DUPLICATES,
+            UsualDuplicates.unknown(layout),
             None,
             np.zeros(layout.n_cells),
         )
@@ -222,18 +219,3 @@ def converter_step(recordings: Sequence[NDArray[Any]], layout: SensorLayout) -> 
     steps = np.diff(np.unique(sample[np.isfinite(sample)]))
     steps = steps[steps > 1e-6 * layout.full_scale]  # smaller differences are rounding
     return float(steps.min()) if len(steps) else 0.0
-
-
-def _usual_duplicates(
-    recordings: Sequence[NDArray[np.float64]], layout: SensorLayout, scale: Scale
-) -> int:
-    """Return how many coincidences two healthy lines may have: the largest count seen, plus
-    log2(250 / recordings)."""
-    most = 0
-    for recording in recordings:
-        duplicates = DuplicateLines.begin(layout)
-        for frames, numbers, runs in segments(recording, scale):
-            moving = informative(frames, runs.start <= numbers[0], scale)
-            duplicates = duplicates.extend(frames, numbers, moving, scale.near)
-        most = max(most, duplicates.most)
-    return most + max(0, int(np.ceil(np.log2(_MANY / len(recordings)))))

@@ -130,7 +130,7 @@ class StreamState:
         self.local = TiledEvents.begin(every if self.tiled else tiles(layout), needed)
         self.accumulated = np.zeros(layout.n_cells)
         self.intermittency = Intermittency.begin(layout)
-        self.duplicates = DuplicateLines.begin(layout)
+        self.duplicates = DuplicateLines.begin(layout, reference.duplicates.shares)
         self.touched = np.zeros(layout.n_cells, bool)
         self.scale: Scale = reference.scale
         # of the whole skin, if there are several tiles

@@ -1,5 +1,7 @@
 """Duplicate lines and address aliasing."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -9,6 +11,7 @@ from diagnostics.evidence.duplicate_lines import DuplicateLines, DuplicatePair, 
 from diagnostics.evidence.reference import Reference
 from diagnostics.evidence.spatial import Exclusion
 from diagnostics.evidence.stream_state import StreamState
+from diagnostics.evidence.usual_duplicates import UsualDuplicates
 
 LAYOUT = SensorLayout(2, 6, 5)
 ROW, COLUMN = np.divmod(np.arange(30), 5)
@@ -168,6 +171,30 @@ def test_a_missing_reading_differs_from_nothing_and_a_position_without_a_cell_ne
     stream = StreamState(layout, Reference.unknown(layout), Exclusion(2.0))
     stream.extend(log)
     assert len(stream.complete().duplicates.duplicate_pairs(usual=2)) == 1
+
+
+def test_lines_that_read_alike_in_the_reference_are_joined_no_more_in_a_log_of_any_length():
+    def alike(seed: int) -> np.ndarray:
+        log = pressed(seed)
+        noise = np.random.default_rng(seed).normal(0, 0.01, (2, len(log), 5))
+        row = pressed(seed + 100)[:, LAYOUT.cells_on(Line(1, "row", 2))]
+        log[:, LAYOUT.cells_on(Line(0, "row", 2))] = row + noise[0]
+        log[:, LAYOUT.cells_on(Line(0, "row", 3))] = row + noise[1]
+        return log
+
+    def joined(usual: UsualDuplicates, log: np.ndarray) -> list[DuplicatePair]:
+        reference = replace(Reference.unknown(LAYOUT), duplicates=usual)
+        stream = StreamState(LAYOUT, reference, Exclusion(2.0))
+        stream.extend(log)
+        return stream.complete().duplicates.duplicate_pairs(usual.most)
+
+    long_log = np.concatenate([alike(seed) for seed in range(4)])
+    scale = Reference.unknown(LAYOUT).scale
+    reference = [alike(seed) for seed in range(10, 18)]
+    assert not joined(UsualDuplicates.fit(reference, LAYOUT, scale), long_log)
+    others = [pressed(seed) for seed in range(10, 18)]
+    found = joined(UsualDuplicates.fit(others, LAYOUT, scale), long_log)
+    assert [(pair.first, pair.second) for pair in found if pair.kind == "row"] == [(2, 3)]
 
 
 def test_cells_that_hold_still_or_are_saturated_or_unloaded_are_not_informative():

@@ -3,19 +3,17 @@ line."""
 
 from __future__ import annotations
 
-import argparse
 import logging
-import math
 import sys
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pkgutil import extend_path
-from typing import Any, NoReturn
 
 from adaptfault import __version__
-from adaptfault.cli.options import LogAboveBars
+from adaptfault.cli.command import Command, Foreign
+from adaptfault.cli.parser import BAD_INPUT, Parser
 from adaptfault.cli.paths import check_paths
-from adaptfault.cli.streams import finish, is_unread, one_line, prepare, settle
+from adaptfault.cli.streams import LogAboveBars, finish, is_unread, one_line, prepare, settle
 from adaptfault.data.plugins import plugins, what_to_install
 from adaptfault.data.shortage import is_shortage
 
@@ -49,42 +47,10 @@ BUILT_IN = {
 """The commands in the order of ``--help``, as the entry points of the repository name them. Another
 package adds one by a module with ``add(subparsers)`` and an entry point in the same group."""
 
-# exit code for unusable input or usage, as monitoring tools understand it ("unknown")
-BAD_INPUT = 3
 
-
-def _number(convert: Callable[[str], float]) -> Callable[[str], float]:
-    """Return a converter of the text of an option that refuses what is negative or not finite."""
-
-    def converted(text: str) -> float:
-        number = convert(text)
-        if not 0 <= number < math.inf:
-            raise argparse.ArgumentTypeError(f"expected a finite number, not below 0, got {text!r}")
-        return number
-
-    converted.__name__ = convert.__name__  # argparse names it
-    return converted
-
-
-class _Parser(argparse.ArgumentParser):
-    """A parser whose numbers are finite and not negative, and whose exit code for wrong usage is 3.
-
-    argparse's own, 2, means here that a technician is needed.
-    """
-
-    def __init__(self, *args: Any, **options: Any) -> None:
-        super().__init__(*args, **options)
-        for kind in (int, float):
-            self.register("type", kind, _number(kind))
-
-    def error(self, message: str) -> NoReturn:
-        self.print_usage(sys.stderr)
-        self.exit(BAD_INPUT, f"{self.prog}: error: {message}\n")
-
-
-def _parser() -> _Parser:
+def _parser() -> Parser:
     """Return the parser of all commands."""
-    parser = _Parser(
+    parser = Parser(
         prog="adaptfault",
         description=(
             "Finds the dead cells of a tactile array and repairs the classifier that reads it."
@@ -95,24 +61,26 @@ def _parser() -> _Parser:
         ),
     )
     parser.add_argument("--version", action="version", version=f"adaptfault {__version__}")
+    parser.set_defaults(make=Foreign.of)
     commands = parser.add_subparsers(dest="command", metavar="COMMAND")
     for module in plugins(GROUP, BUILT_IN).values():
         module.add(commands)
     return parser
 
 
-def _with_left_out(args: argparse.Namespace, code: int) -> int:
+def _with_left_out(command: Command, code: int) -> int:
     """Return the exit code of a command; where files were left out, it is 1 at least, and the last
     line says so."""
-    left_out = getattr(args, "left_out", 0)
-    if not left_out:
+    if not command.left_out:
         return code
-    were = "1 file or recording was" if left_out == 1 else f"{left_out} files or recordings were"
-    print(f"adaptfault {args.command}: {were} left out; see the errors above", file=sys.stderr)
+    were = f"{command.left_out} files or recordings were"
+    if command.left_out == 1:
+        were = "1 file or recording was"
+    print(f"adaptfault {command.command}: {were} left out; see the errors above", file=sys.stderr)
     return max(code, 1)
 
 
-def _failed(args: argparse.Namespace, error: Exception) -> int:
+def _failed(name: str, error: Exception) -> int:
     """Tell an error in one line; return the exit code.
 
     Python's own code for a traceback, 1, would read as "degraded but handled".
@@ -125,13 +93,10 @@ def _failed(args: argparse.Namespace, error: Exception) -> int:
     elif isinstance(error, ValueError | OSError) or is_shortage(error):
         what = one_line(error)
     if what is not None:
-        print(f"adaptfault {args.command}: error: {what}", file=sys.stderr)
+        print(f"adaptfault {name}: error: {what}", file=sys.stderr)
         return BAD_INPUT
     traceback.print_exception(error)
-    print(
-        f"adaptfault {args.command}: internal error; please report the lines above",
-        file=sys.stderr,
-    )
+    print(f"adaptfault {name}: internal error; please report the lines above", file=sys.stderr)
     return BAD_INPUT
 
 
@@ -154,15 +119,16 @@ def _run(argv: Sequence[str] | None) -> int:
     log = logging.getLogger("adaptfault")
     handler = LogAboveBars()
     log.addHandler(handler)
+    command = args.make(args)
     try:
-        check_paths(args)
-        code = int(args.run(args))
-        return finish(args, _with_left_out(args, code))
+        check_paths(command)
+        code = command.run()
+        return finish(command, _with_left_out(command, code))
     except KeyboardInterrupt:
-        further = "; run the same command to continue" if getattr(args, "continues", False) else ""
+        further = "; run the same command to continue" if command.continues else ""
         print(f"adaptfault {args.command}: interrupted{further}", file=sys.stderr)
         return 130
     except Exception as error:
-        return _failed(args, error)
+        return _failed(args.command, error)
     finally:
         log.removeHandler(handler)

@@ -2,139 +2,120 @@
 
 from __future__ import annotations
 
-import argparse
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
-from adaptfault.cli.options import (
-    Commands,
-    add_device,
-    add_recordings,
-    add_trust,
-    command,
-    device,
-    emit,
-    fault_set,
-    progress,
-    say,
-)
+from adaptfault.cli.command import argument, option
+from adaptfault.cli.diagnoses import fault_set
 from adaptfault.cli.paths import Read, Stated, WrittenFolder
+from adaptfault.cli.reading import Reading, perhaps_recordings
+from adaptfault.cli.shared_options import Trusting, chosen_device, device_option, faults_option
 
 if TYPE_CHECKING:
     from adaptfault.adaptation.adapter import Adapter
     from diagnostics import FaultSet
 
-_EXAMPLE = """  adaptfault adapt model grasps/ --faults diagnosis.json --out adapted
+
+class Repairing(Trusting, Reading):
+    """What a command has that opens an adapter."""
+
+    takes_targets = True
+    model: Read
+    recordings: list[Read] = perhaps_recordings()
+    faults: Stated | None = faults_option()
+    device: str = device_option()
+
+    def open_adapter(self) -> Adapter:
+        """Return a kept adapter, a bundle's, or a new one for the model and its recordings."""
+        from adaptfault.adaptation.adapter_files import SCHEMA, load_adapter
+        from adaptfault.cli.trained_model import TrainedModel, open_bundle
+        from adaptfault.models.store import schema_of
+
+        bundle = open_bundle(self, self.model)
+        is_kept = bundle is None and schema_of(self.model) == SCHEMA
+        if self.recordings and (bundle is not None or is_kept):
+            raise ValueError(f"{self.model} holds its own windows: leave the recordings out")
+        if bundle is not None:
+            return bundle.parts.adapter()
+        if is_kept:
+            return load_adapter(self.model)
+        from adaptfault.adaptation.adapter import Adapter
+
+        if not self.recordings:
+            raise ValueError(
+                f"{self.model} is a model: give the fault-free recordings that it was trained on,"
+                " too"
+            )
+        trained = TrainedModel.open(self, self.model)
+        train, validation, _ = trained.parts(trained.recordings(self, self.recordings))
+        return Adapter(trained.network, train, validation)
+
+
+class Adapt(Repairing):
+    """Repair a model for a set of faulty cells."""
+
+    example = """  adaptfault adapt model grasps/ --faults diagnosis.json --out adapted
       grasps/: the fault-free recordings that the model was trained on
   adaptfault adapt model grasps/ --keep adapter
       stores what a robot needs to adapt without the recordings, at most 20 MB; then, on the robot:
   adaptfault adapt adapter --faults 3,17 --forecast"""
 
-
-def add(commands: Commands) -> None:
-    """Add the command."""
-    parser = command(commands, "adapt", "repair a model for a set of faulty cells", _EXAMPLE)
-    parser.add_argument(
-        "model",
-        type=Read,
-        metavar="MODEL",
-        help="folder written by adaptfault train or --keep, or a bundle",
+    model: Read = argument("folder written by adaptfault train or --keep, or a bundle", "MODEL")
+    faults: Stated | None = faults_option()
+    out: WrittenFolder | None = option("where the adapted model goes", "FOLDER")
+    forecast: bool = option("print the accuracy to expect, and adapt only with --out")
+    keep: WrittenFolder | None = option(
+        "store everything that later adaptations need, without recordings", "FOLDER"
     )
-    add_recordings(parser, least=0, targets=True)
-    parser.add_argument(
-        "--faults", type=Stated, metavar="F", help="a diagnosis (JSON), or cell indices as 3,17,200"
-    )
-    parser.add_argument(
-        "--out", type=WrittenFolder, metavar="FOLDER", help="where the adapted model goes"
-    )
-    parser.add_argument(
-        "--forecast",
-        action="store_true",
-        help="print the accuracy to expect, and adapt only with --out",
-    )
-    parser.add_argument(
-        "--keep",
-        type=WrittenFolder,
-        metavar="FOLDER",
-        help="store everything that later adaptations need, without recordings",
-    )
-    parser.add_argument(
-        "--method",
+    method: Literal["auto", "fill", "head", "finetune", "scratch"] = option(
+        "method of adaptation (default auto: the first that is accurate enough)",
         default="auto",
-        choices=("auto", "fill", "head", "finetune", "scratch"),
-        help="method of adaptation (default auto: the first that is accurate enough)",
     )
-    parser.add_argument("--budget", type=float, metavar="S", help="seconds of training allowed")
-    parser.add_argument("--seed", type=int, default=0, help="random seed of training (default 0)")
-    add_device(parser)
-    add_trust(parser)
-    parser.set_defaults(run=run)
+    budget: float | None = option("seconds of training allowed", "S")
+    seed: int = option("random seed of training (default 0)", default=0)
+    device: str = device_option()
 
-
-def run(args: argparse.Namespace) -> int:
-    """Keep the adapter, forecast, adapt and save, as the options state."""
-    if args.faults is None and args.keep is None:
-        raise ValueError(
-            "nothing to do: give --faults F with --out or --forecast, or --keep FOLDER"
-        )
-    if (args.faults is None) != (args.out is None and not args.forecast):
-        raise ValueError(
-            "--faults F needs --out FOLDER or --forecast, and either of them needs --faults F"
-        )
-    adapter = open_adapter(args)
-    result: dict[str, Any] = {"schema": "adaptfault.adapt/1"}
-    lines: list[str] = []
-    if args.keep is not None:
-        from adaptfault.adaptation.adapter_files import save_adapter
-
-        save_adapter(args.keep, adapter)
-        result["kept"] = args.keep
-        lines.append(f"adapter kept: {args.keep}")
-    if args.faults is not None:
-        faults = fault_set(args.faults, adapter.model.layout)
-        adapter = adapter.to(device(args))
-        if args.forecast:
-            say(
-                args,
-                f"{len(faults)} of {adapter.model.layout.present.sum()} cells are faulty;"
-                " forecasting",
+    def run(self) -> int:
+        """Keep the adapter, forecast, adapt and save, as the options state."""
+        if self.faults is None and self.keep is None:
+            raise ValueError(
+                "nothing to do: give --faults F with --out or --forecast, or --keep FOLDER"
             )
-            forecast = adapter.forecast(faults)
-            result["forecast"] = forecast.to_dict()
-            lines.append(str(forecast))
-        if args.out is not None:
-            _adapt(args, adapter, faults, result, lines)
-    emit(args, result, "\n".join(lines))
-    return 0
+        if (self.faults is None) != (self.out is None and not self.forecast):
+            raise ValueError(
+                "--faults F needs --out FOLDER or --forecast, and either of them needs --faults F"
+            )
+        adapter = self.open_adapter()
+        result: dict[str, Any] = {"schema": "adaptfault.adapt/1"}
+        lines: list[str] = []
+        if self.keep is not None:
+            from adaptfault.adaptation.adapter_files import save_adapter
+
+            save_adapter(self.keep, adapter)
+            result["kept"] = self.keep
+            lines.append(f"adapter kept: {self.keep}")
+        if self.faults is not None:
+            faults = fault_set(self.faults, adapter.model.layout)
+            adapter = adapter.to(chosen_device(self.device))
+            if self.forecast:
+                self.say(
+                    f"{len(faults)} of {adapter.model.layout.present.sum()} cells are faulty;"
+                    " forecasting"
+                )
+                forecast = adapter.forecast(faults)
+                result["forecast"] = forecast.to_dict()
+                lines.append(str(forecast))
+            if self.out is not None:
+                _adapt(self, self.out, adapter, faults, result, lines)
+        self.emit(result, "\n".join(lines))
+        return 0
 
 
-def open_adapter(args: argparse.Namespace) -> Adapter:
-    """Return a kept adapter, a bundle's, or a new one for the model and its recordings."""
-    from adaptfault.adaptation.adapter_files import SCHEMA, load_adapter
-    from adaptfault.cli.trained_model import TrainedModel, open_bundle
-    from adaptfault.models.store import schema_of
-
-    bundle = open_bundle(args, args.model)
-    if bundle is not None:
-        if args.recordings:
-            raise ValueError(f"{args.model} holds its own windows: leave the recordings out")
-        return bundle.parts.adapter()
-    if schema_of(args.model) == SCHEMA:
-        if args.recordings:
-            raise ValueError(f"{args.model} holds its own windows: leave the recordings out")
-        return load_adapter(args.model)
-    from adaptfault.adaptation.adapter import Adapter
-
-    if not args.recordings:
-        raise ValueError(
-            f"{args.model} is a model: give the fault-free recordings that it was trained on, too"
-        )
-    trained = TrainedModel.open(args, args.model)
-    train, validation, _ = trained.parts(trained.recordings(args, args.recordings))
-    return Adapter(trained.network, train, validation)
+add = Adapt.add
 
 
 def _adapt(
-    args: argparse.Namespace,
+    args: Adapt,
+    out: str,
     adapter: Adapter,
     faults: FaultSet,
     result: dict[str, Any],
@@ -142,13 +123,13 @@ def _adapt(
 ) -> None:
     verb = "is" if len(faults) == 1 else "are"
     cells = adapter.model.layout.present.sum()
-    say(args, f"{len(faults)} of {cells} cells {verb} faulty; adapting")
+    args.say(f"{len(faults)} of {cells} cells {verb} faulty; adapting")
     adaptation = adapter.adapt(
-        faults, method=args.method, budget=args.budget, seed=args.seed, progress=progress(args)
+        faults, method=args.method, budget=args.budget, seed=args.seed, progress=args.progress
     )
-    adaptation.save(args.out)
+    adaptation.save(out)
     result |= {
-        "adapted": args.out,
+        "adapted": out,
         "fault_set": list(faults),
         "fault_free_accuracy": adapter.fault_free_accuracy,
         "scores": adaptation.scores.to_dict(),
@@ -161,5 +142,5 @@ def _adapt(
         f"validation, {len(faults)} cells removed: {adaptation.scores}",
         *([] if sets is None else [f"sets that hold the class at 90 %: {sets:.2f} classes"]),
         *(f"  {stage}" for stage in adaptation.stages),
-        f"adapted model: {args.out}",
+        f"adapted model: {out}",
     ]

@@ -3,114 +3,93 @@ faults."""
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
+from adaptfault.cli.command import argument, option
 from adaptfault.cli.inject_option import INJECT_HELP, parse_faults
-from adaptfault.cli.options import (
-    Commands,
-    add_device,
-    add_recordings,
-    add_trust,
-    command,
-    device,
-    emit,
-    say,
-)
 from adaptfault.cli.paths import Read
+from adaptfault.cli.reading import Reading
+from adaptfault.cli.shared_options import Trusting, chosen_device, device_option
 
 if TYPE_CHECKING:
     from adaptfault.adaptation.result import Adaptation
     from adaptfault.data.windows import Windows
 
-_EXAMPLE = """  adaptfault evaluate model grasps/ --inject random:5=short
+
+class Evaluate(Trusting, Reading):
+    """Score a model on the test recordings."""
+
+    takes_targets = True
+    example = """  adaptfault evaluate model grasps/ --inject random:5=short
   adaptfault evaluate model grasps/ --inject row:0:3=open --adapted adapted"""
 
-
-def add(commands: Commands) -> None:
-    """Add the command."""
-    parser = command(commands, "evaluate", "score a model on the test recordings", _EXAMPLE)
-    parser.add_argument(
-        "model", type=Read, metavar="MODEL", help="folder written by adaptfault train, or a bundle"
-    )
-    add_recordings(parser, targets=True)
-    parser.add_argument(
-        "--adapted", type=Read, metavar="FOLDER", help="score this adaptation of the model instead"
-    )
-    parser.add_argument(
-        "--head",
+    model: Read = argument("folder written by adaptfault train, or a bundle", "MODEL")
+    adapted: Read | None = option("score this adaptation of the model instead", "FOLDER")
+    head: Literal["auto", "linear"] = option(
+        "auto: the head that the model was stored with (default); linear: that of its network,"
+        " as in the paper",
         default="auto",
-        choices=("auto", "linear"),
-        help=(
-            "auto: the head that the model was stored with (default); linear: that of its network,"
-            " as in the paper"
-        ),
     )
-    parser.add_argument("--inject", action="append", default=[], metavar="FAULT", help=INJECT_HELP)
-    parser.add_argument(
-        "--seed", type=int, default=0, help="random seed of random faults (default 0)"
-    )
-    parser.add_argument(
-        "--all", action="store_true", help="score on all recordings, not only on the test share"
-    )
-    add_device(parser)
-    add_trust(parser)
-    parser.set_defaults(run=run)
+    inject: list[str] = option(INJECT_HELP, "FAULT", default=[], action="append")
+    seed: int = option("random seed of random faults (default 0)", default=0)
+    all: bool = option("score on all recordings, not only on the test share")
+    device: str = device_option()
+
+    def run(self) -> int:
+        """Score."""
+        import numpy as np
+
+        from adaptfault.adaptation.result import Adaptation
+        from adaptfault.cli.trained_model import TrainedModel, say_short
+        from diagnostics import inject
+
+        trained = TrainedModel.open(self, self.model)
+        model = trained.network
+        recordings = trained.rewired(trained.recordings(self, self.recordings))
+        classifier = Adaptation.load(self.adapted) if self.adapted else trained.adaptation
+        if self.head == "linear":
+            classifier.model.head = None
+        classifier.model.to(chosen_device(self.device))
+        if classifier.fault_set.n_cells != model.layout.n_cells:
+            raise ValueError(
+                f"{self.adapted}: an adaptation over {classifier.fault_set.n_cells} cells, not of"
+                " this model"
+            )
+        whole = self.all or trained.split_seed is None
+        if whole and not self.all:
+            self.say(
+                f"{self.model} does not store the split of its training: scored on all recordings"
+                " given"
+            )
+        say_short(self, recordings, model.length)
+        windows = trained.windows(recordings) if whole else trained.parts(recordings)[2]
+        rng = np.random.default_rng(self.seed)
+        faults = parse_faults(self.inject, recordings.layout, rng)
+        if faults:
+            which = np.unique(windows.recording)
+            broken = [
+                inject(r, faults, recordings.layout, seed=self.seed + i) if i in which else r
+                for i, r in enumerate(recordings.frames)
+            ]
+            every = trained.windows(recordings, broken)
+            windows = every.select(np.isin(every.recording, which))
+        if trained.is_regression:
+            result, first, *more = _of_values(classifier, windows, trained.class_names)
+        else:
+            result, first, *more = _of_classes(classifier, windows)
+        cells = {c for fault in faults for c in fault.cells}
+        first = f"{len(cells)} cells faulty: {first}" if cells else first
+        document = {
+            "schema": "adaptfault.evaluate/1",
+            **result,
+            "injected": [fault.to_dict() for fault in faults],
+        }
+        self.emit(document, "\n".join([first, *more]))
+        return 0
 
 
-def run(args: argparse.Namespace) -> int:
-    """Score."""
-    import numpy as np
-
-    from adaptfault.adaptation.result import Adaptation
-    from adaptfault.cli.trained_model import TrainedModel, say_short
-    from diagnostics import inject
-
-    trained = TrainedModel.open(args, args.model)
-    model = trained.network
-    recordings = trained.rewired(trained.recordings(args, args.recordings))
-    classifier = Adaptation.load(args.adapted) if args.adapted else trained.adaptation
-    if args.head == "linear":
-        classifier.model.head = None
-    classifier.model.to(device(args))
-    if classifier.fault_set.n_cells != model.layout.n_cells:
-        raise ValueError(
-            f"{args.adapted}: an adaptation over {classifier.fault_set.n_cells} cells, not of this"
-            " model"
-        )
-    whole = args.all or trained.split_seed is None
-    if whole and not args.all:
-        say(
-            args,
-            f"{args.model} does not store the split of its training: scored on all recordings"
-            " given",
-        )
-    say_short(args, recordings, model.length)
-    windows = trained.windows(recordings) if whole else trained.parts(recordings)[2]
-    rng = np.random.default_rng(args.seed)
-    faults = parse_faults(args.inject, recordings.layout, rng)
-    if faults:
-        which = np.unique(windows.recording)
-        broken = [
-            inject(r, faults, recordings.layout, seed=args.seed + i) if i in which else r
-            for i, r in enumerate(recordings.frames)
-        ]
-        every = trained.windows(recordings, broken)
-        windows = every.select(np.isin(every.recording, which))
-    if trained.is_regression:
-        result, first, *more = _of_values(classifier, windows, trained.class_names)
-    else:
-        result, first, *more = _of_classes(classifier, windows)
-    cells = {c for fault in faults for c in fault.cells}
-    first = f"{len(cells)} cells faulty: {first}" if cells else first
-    document = {
-        "schema": "adaptfault.evaluate/1",
-        **result,
-        "injected": [fault.to_dict() for fault in faults],
-    }
-    emit(args, document, "\n".join([first, *more]))
-    return 0
+add = Evaluate.add
 
 
 def _of_classes(classifier: Adaptation, windows: Windows) -> tuple[Any, ...]:

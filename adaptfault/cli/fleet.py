@@ -5,24 +5,15 @@ from __future__ import annotations
 
 import argparse
 
-from adaptfault.cli.options import (
-    Commands,
-    add_metrics,
-    add_sign,
-    add_trust,
-    command,
-    emit,
-    progress,
-    say,
-    trust,
-)
-from adaptfault.cli.paths import Read, Written, refuse_overwriting, written_into
+from adaptfault.cli.command import Command, Commands, argument, option
+from adaptfault.cli.paths import Read, Written, WrittenInto, refuse_overwriting, written_into
+from adaptfault.cli.shared_options import Signing, metrics_option, sign_option
 
 _REPORT = "report.json"
 _PAGE = "report.html"
 _OUT = written_into("ledger.jsonl", "run.lock", _REPORT, _PAGE)
 
-_EXAMPLE = """  adaptfault fleet maintain FLEET.toml --jobs 8
+_MAINTAIN = """  adaptfault fleet maintain FLEET.toml --jobs 8
       FLEET.toml lists robots as [[robots]] with name, bundle, recordings
       (and tags, commissioned = 2025-03-01),
       or as bundles = "robots/*/robot.bundle" and recordings = "{bundle_dir}/recordings";
@@ -33,109 +24,99 @@ _SURVIVAL = """  adaptfault fleet survival FLEET.toml --picture survival.png
       and whom to service in the next 30 days"""
 
 
+class Maintain(Signing):
+    """Maintain all robots of a list; exit code 2, 3, 1, 0: the worst of them."""
+
+    example = _MAINTAIN
+    decides = True
+    continues = True
+
+    fleet: Read = argument("list of the robots", "FLEET.toml")
+    jobs: int | None = option("worker processes (default: as many as cores)", "N")
+    dask: str | None = option("a Dask scheduler whose workers do it, as tcp://host:8786", "ADDRESS")
+    dry_run: bool = option("report only, change nothing")
+    budget: float | None = option("seconds that one adaptation may take", "S")
+    limit: float | None = option(
+        "seconds that one robot may take; past it, it is an error (default: none)", "S"
+    )
+    out: WrittenInto | None = option(
+        "of ledger and reports (default: FLEET.fleet)", "FOLDER", type=_OUT
+    )
+    metrics: Written | None = metrics_option()
+    sign: Read | None = sign_option("each bundle after its run", last=True)
+
+    def run(self) -> int:
+        """Maintain; the exit code is that of the worst robot."""
+        import json
+        from pathlib import Path
+
+        from adaptfault.data.atomic import atomic_write
+        from adaptfault.fleet.listing import Fleet
+        from adaptfault.fleet.run import maintain_fleet
+
+        fleet = Fleet.read(self.fleet)
+        if not self.out:
+            self.out = _OUT(Path(self.fleet).with_suffix(".fleet"))
+        refuse_overwriting(self, fleet.paths())
+        folder = Path(self.out)
+        report = maintain_fleet(
+            fleet,
+            folder,
+            jobs=self.jobs,
+            dask=self.dask,
+            dry_run=self.dry_run,
+            budget=self.budget,
+            limit=self.limit,
+            **self.trusted(),
+            sign=self.sign,
+            progress=self.progress,
+        )
+        atomic_write(
+            folder / _REPORT, json.dumps(report.to_dict(), indent=1, allow_nan=False).encode()
+        )
+        if self.metrics:
+            from adaptfault.robot.metrics import write_metrics
+
+            write_metrics(self.metrics, report.metrics())
+        page = report.write_page(folder / _PAGE)
+        self.say(f"report: {page}")
+        self.emit(report.to_dict(), str(report))
+        return report.exit_code
+
+
+class Survival(Command):
+    """How long wires and cells last, and whom to service next."""
+
+    example = _SURVIVAL
+
+    fleet: Read = argument("list of the robots", "FLEET.toml")
+    days: float = option("time ahead (default 30)", "N", default=30.0)
+    picture: Written | None = option("write the survival curves as PNG", "FILE")
+
+    def run(self) -> int:
+        """Tell how the sensors of a fleet age."""
+        from adaptfault.data.atomic import atomic_figure
+        from adaptfault.fleet.listing import Fleet
+        from adaptfault.prognosis.lifetimes import FleetSurvival
+
+        fleet = Fleet.read(self.fleet)
+        refuse_overwriting(self, fleet.paths())
+        found = FleetSurvival.of(fleet, self.days)
+        if self.picture:
+            atomic_figure(self.picture, found.plot(), dpi=150)
+        self.emit(found.to_dict(), str(found))
+        return 0
+
+
 def add(commands: Commands) -> None:
     """Add the command."""
     group = commands.add_parser(
         "fleet",
         help="maintain many robots",
         description="Maintain many robots.",
-        epilog=f"example:\n{_EXAMPLE}\n{_SURVIVAL}",
+        epilog=f"example:\n{_MAINTAIN}\n{_SURVIVAL}",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     inner = group.add_subparsers(dest="fleet_command", required=True, metavar="COMMAND")
-    parser = command(
-        inner,
-        "maintain",
-        "maintain all robots of a list; exit code 2, 3, 1, 0: the worst of them",
-        _EXAMPLE,
-    )
-    parser.add_argument("fleet", type=Read, metavar="FLEET.toml", help="list of the robots")
-    parser.add_argument(
-        "--jobs", type=int, metavar="N", help="worker processes (default: as many as cores)"
-    )
-    parser.add_argument(
-        "--dask", metavar="ADDRESS", help="a Dask scheduler whose workers do it, as tcp://host:8786"
-    )
-    parser.add_argument("--dry-run", action="store_true", help="report only, change nothing")
-    parser.add_argument(
-        "--budget", type=float, metavar="S", help="seconds that one adaptation may take"
-    )
-    parser.add_argument(
-        "--limit",
-        type=float,
-        metavar="S",
-        help="seconds that one robot may take; past it, it is an error (default: none)",
-    )
-    parser.add_argument(
-        "--out",
-        type=_OUT,
-        metavar="FOLDER",
-        help="of ledger and reports (default: FLEET.fleet)",
-    )
-    add_metrics(parser)
-    add_trust(parser)
-    add_sign(parser, "each bundle after its run")
-    parser.set_defaults(run=run, decides=True, continues=True)
-    parser = command(
-        inner, "survival", "how long wires and cells last, and whom to service next", _SURVIVAL
-    )
-    parser.add_argument("fleet", type=Read, metavar="FLEET.toml", help="list of the robots")
-    parser.add_argument(
-        "--days", type=float, default=30.0, metavar="N", help="time ahead (default 30)"
-    )
-    parser.add_argument(
-        "--picture", type=Written, metavar="FILE", help="write the survival curves as PNG"
-    )
-    parser.set_defaults(run=survival)
-
-
-def run(args: argparse.Namespace) -> int:
-    """Maintain; the exit code is that of the worst robot."""
-    import json
-    from pathlib import Path
-
-    from adaptfault.data.atomic import atomic_write
-    from adaptfault.fleet.listing import Fleet
-    from adaptfault.fleet.run import maintain_fleet
-
-    fleet = Fleet.read(args.fleet)
-    if not args.out:
-        args.out = _OUT(Path(args.fleet).with_suffix(".fleet"))
-    refuse_overwriting(args, fleet.paths())
-    folder = Path(args.out)
-    report = maintain_fleet(
-        fleet,
-        folder,
-        jobs=args.jobs,
-        dask=args.dask,
-        dry_run=args.dry_run,
-        budget=args.budget,
-        limit=args.limit,
-        **trust(args),
-        sign=args.sign,
-        progress=progress(args),
-    )
-    atomic_write(folder / _REPORT, json.dumps(report.to_dict(), indent=1, allow_nan=False).encode())
-    if args.metrics:
-        from adaptfault.robot.metrics import write_metrics
-
-        write_metrics(args.metrics, report.metrics())
-    page = report.write_page(folder / _PAGE)
-    say(args, f"report: {page}")
-    emit(args, report.to_dict(), str(report))
-    return report.exit_code
-
-
-def survival(args: argparse.Namespace) -> int:
-    """Tell how the sensors of a fleet age."""
-    from adaptfault.data.atomic import atomic_figure
-    from adaptfault.fleet.listing import Fleet
-    from adaptfault.prognosis.lifetimes import FleetSurvival
-
-    fleet = Fleet.read(args.fleet)
-    refuse_overwriting(args, fleet.paths())
-    found = FleetSurvival.of(fleet, args.days)
-    if args.picture:
-        atomic_figure(args.picture, found.plot(), dpi=150)
-    emit(args, found.to_dict(), str(found))
-    return 0
+    Maintain.add(inner)
+    Survival.add(inner)

@@ -3,78 +3,64 @@ them."""
 
 from __future__ import annotations
 
-import argparse
 from typing import Any
 
-from adaptfault.cli.options import Commands, add_trust, command, emit, trust
+from adaptfault.cli.command import option
 from adaptfault.cli.paths import Read, Written
+from adaptfault.cli.shared_options import Trusting, bundle_argument
 
-_EXAMPLE = """  adaptfault history robot.bundle --last 10
+
+class History(Trusting):
+    """List maintenance runs and versions."""
+
+    example = """  adaptfault history robot.bundle --last 10
   adaptfault history robot.bundle --confirm
       ends the probation of the version that runs
   adaptfault history robot.bundle --trend --picture trend.png
       cells and lines whose gain, offset, noise or blinks drift, and when they cross their limits"""
 
+    bundle: Read = bundle_argument()
+    last: int | None = option("only the last N entries", "N")
+    confirm: bool = option("end the probation of the version that runs")
+    trend: bool = option("what drifts from run to run, in place of the runs")
+    picture: Written | None = option("with --trend: write the drifting series as PNG", "FILE")
 
-def add(commands: Commands) -> None:
-    """Add the command."""
-    parser = command(commands, "history", "list maintenance runs and versions", _EXAMPLE)
-    parser.add_argument(
-        "bundle",
-        type=Read,
-        metavar="BUNDLE",
-        help="folder written by adaptfault train --out X.bundle",
-    )
-    parser.add_argument("--last", type=int, metavar="N", help="only the last N entries")
-    parser.add_argument(
-        "--confirm", action="store_true", help="end the probation of the version that runs"
-    )
-    parser.add_argument(
-        "--trend", action="store_true", help="what drifts from run to run, in place of the runs"
-    )
-    parser.add_argument(
-        "--picture",
-        type=Written,
-        metavar="FILE",
-        help="with --trend: write the drifting series as PNG",
-    )
-    add_trust(parser)
-    parser.set_defaults(run=run)
+    def run(self) -> int:
+        """List runs and versions."""
+        from adaptfault.bundle.bundle import Bundle
+        from adaptfault.bundle.pointer import Pointer
 
+        bundle = Bundle.open(self.bundle, **self.trusted())
+        if self.picture and not self.trend:
+            raise ValueError("--picture shows trends: give --trend, too")
+        if self.confirm:
+            bundle.confirm()
+        if self.trend:
+            from adaptfault.prognosis.cell_condition import AgeingTable
 
-def run(args: argparse.Namespace) -> int:
-    """List runs and versions."""
-    from adaptfault.bundle.bundle import Bundle
-    from adaptfault.bundle.pointer import Pointer
-
-    bundle = Bundle.open(args.bundle, **trust(args))
-    if args.picture and not args.trend:
-        raise ValueError("--picture shows trends: give --trend, too")
-    if args.confirm:
-        bundle.confirm()
-    if args.trend:
-        from adaptfault.prognosis.cell_condition import AgeingTable
-
-        report = AgeingTable.of(bundle).report()
-        if args.picture:
-            report.write_picture(args.picture)
-        emit(args, report.to_dict(), str(report))
+            report = AgeingTable.of(bundle).report()
+            if self.picture:
+                report.write_picture(self.picture)
+            self.emit(report.to_dict(), str(report))
+            return 0
+        pointer = Pointer.read(bundle.path)
+        runs = bundle.journal.runs(self.last)
+        problems = bundle.problems(repair=False)
+        result = {
+            "schema": "adaptfault.history/1",
+            "version": bundle.active().number,
+            "probation": pointer.probation,
+            "versions": bundle.versions.numbers,
+            "runs": runs,
+            "problems": problems,
+        }
+        state = f", on probation, started {pointer.starts} times" if pointer.probation else ""
+        lines = [f"{bundle.active()} runs{state}", *(line(run) for run in runs)]
+        self.emit(result, "\n".join([*lines, *(f"damage: {problem}" for problem in problems)]))
         return 0
-    pointer = Pointer.read(bundle.path)
-    runs = bundle.journal.runs(args.last)
-    problems = bundle.problems(repair=False)
-    result = {
-        "schema": "adaptfault.history/1",
-        "version": bundle.active().number,
-        "probation": pointer.probation,
-        "versions": bundle.versions.numbers,
-        "runs": runs,
-        "problems": problems,
-    }
-    state = f", on probation, started {pointer.starts} times" if pointer.probation else ""
-    lines = [f"{bundle.active()} runs{state}", *(line(run) for run in runs)]
-    emit(args, result, "\n".join([*lines, *(f"damage: {problem}" for problem in problems)]))
-    return 0
+
+
+add = History.add
 
 
 def line(run: dict[str, Any]) -> str:

@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
-from adaptfault.cli.options import (
-    fit_diagnoser,
-    fitting_bar,
-    load_recordings,
-    open_reported,
-    report_inferred,
-    report_problems,
-    say,
+from adaptfault.cli.fitting import fit_diagnoser, fitting_bar
+from adaptfault.cli.paths import Read, Written
+from adaptfault.cli.reading import Reading
+from adaptfault.cli.shared_options import (
+    Trusting,
+    cache_option,
+    reference_option,
 )
-from adaptfault.cli.paths import Read
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -46,46 +43,51 @@ class InspectedLog:
         return _reasons(diagnosis, self.inspection.findings, self.bundle, untested_code)
 
 
-def add_reference(group: Any) -> None:
-    """Add the option of what a log is compared with to a parser or a group of options."""
-    group.add_argument(
-        "--reference",
-        type=Read,
-        nargs="+",
-        metavar="FILE",
-        help="fault-free recordings of the same array, or a bundle",
-    )
+class Inspecting(Trusting, Reading):
+    """What a command has that inspects a log."""
+
+    reference: list[Read] | None = reference_option()
+    no_cache: bool = cache_option()
+
+
+class Paged(Protocol):
+    """What it has where it writes a page."""
+
+    recordings: list[Read]
+    html: Written | None
+    count_from: int
 
 
 def inspect_log(
-    args: argparse.Namespace, part: Callable[[Opened], Recordings] | None = None
+    args: Inspecting, part: Callable[[Opened], Recordings] | None = None
 ) -> InspectedLog:
     """Open a log and inspect it, with the reference that the options state.
 
     Args:
-        args: the options of :func:`~adaptfault.cli.options.add_recordings`,
-            :func:`add_reference`, :func:`~adaptfault.cli.options.add_cache` and
-            :func:`~adaptfault.cli.options.add_trust`.
+        args: the command.
         part: returns the recordings of the log that are healthy, in place of a reference.
     """
     bundle = _bundle(args)
-    healthy = load_recordings(args, args.reference) if args.reference and bundle is None else None
+    healthy = args.load(args.reference) if args.reference and bundle is None else None
     diagnoser = None if bundle is None else bundle.diagnoser()
     known = diagnoser or healthy
-    log = open_reported(args, args.recordings, None if known is None else known.layout)
-    report_inferred(args, log.inferred)
+    log = args.open(args.recordings, None if known is None else known.layout)
+    args.say_inferred(log.inferred)
     if part is not None:
         healthy = part(log)
     if healthy is not None:  # fitted once the log is known to be of the same array
-        diagnoser = fit_diagnoser(args, healthy)
+        beside = None if args.no_cache or not args.reference else args.reference[0]
+        diagnoser = fit_diagnoser(args, healthy, beside=beside)
     inspection = _inspected(args, log, diagnoser, bundle, _healthy(bundle, healthy))
     return InspectedLog(log, inspection, bundle)
 
 
 def write_page(
-    args: argparse.Namespace, diagnosis: Diagnosis, code: int, notes: list[str], *, compared: bool
+    args: Paged, diagnosis: Diagnosis, code: int, notes: list[str], *, compared: bool
 ) -> None:
     """Write the page that ``--html`` asks for; it says what the exit code and the notes say."""
+    if not args.html:
+        return
     from adaptfault.evaluation.html_diagnosis import write_diagnosis
 
     name = ", ".join(args.recordings)
@@ -101,7 +103,7 @@ def write_page(
 
 
 def _inspected(
-    args: argparse.Namespace,
+    args: Inspecting,
     log: Opened,
     diagnoser: SelfDiagnosis | None,
     bundle: Bundle | None,
@@ -120,12 +122,12 @@ def _inspected(
     def parts() -> Iterator[list[NDArray[Any]]]:
         for i, part in enumerate(log.parts()):
             if i == 0:  # of a longer log, those of the first part
-                report_problems(args, copies(part, log.names))
+                args.tell_problems(copies(part, log.names))
             if is_known and i == 0:
-                report_problems(args, check_scale(args.recordings[0], part, log.layout))
+                args.tell_problems(check_scale(args.recordings[0], part, log.layout))
             yield part if version is None else [version.undo(frames) for frames in part]
 
-    say(args, f"diagnosing {len(log)} recording{'s' * (len(log) != 1)}")
+    args.say(f"diagnosing {len(log)} recording{'s' * (len(log) != 1)}")
     with fitting_bar(args) as advance:
         return inspect_parts(
             parts(),
@@ -156,12 +158,12 @@ def _healthy(bundle: Bundle | None, recordings: Recordings | None) -> list[NDArr
     )
 
 
-def _bundle(args: argparse.Namespace) -> Bundle | None:
+def _bundle(args: Inspecting) -> Bundle | None:
     """Return the bundle that is given as reference; None for recordings, and without a
     reference."""
     from adaptfault.cli.trained_model import open_bundle
 
-    if len(args.reference or []) == 1:
+    if args.reference and len(args.reference) == 1:
         return open_bundle(args, args.reference[0])
     if args.trust:
         raise ValueError("--trust needs a bundle: --reference BUNDLE")

@@ -6,13 +6,16 @@ as all others are.
 
 from __future__ import annotations
 
-import argparse
 import os
 import re
 import stat
 from collections.abc import Callable, Iterator, Sequence
 from functools import cache
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from adaptfault.cli.command import Command
 
 Identity = tuple[int, int]  # device and inode: the same for each spelling and each link
 
@@ -64,38 +67,38 @@ class WrittenRecordings(Written):
     """Recordings that a command writes: a file, or a folder."""
 
 
-def check_paths(args: argparse.Namespace) -> None:
+def check_paths(command: Command) -> None:
     """Check the paths of a command before anything heavy is imported.
 
     Raises:
         ValueError: an input is not there, an output has no name or no folder, or an output is what
             is read.
     """
-    _check_bundle(args)
-    inputs = list(_paths(args, Read))
+    _check_bundle(command)
+    inputs = list(_paths(command, Read))
     for _, path in inputs:
         # an empty path, as of a shell variable that is not set, is none either
         if not isinstance(path, Stated) and not os.path.lexists(path):
             raise ValueError(f"{path or repr(path)}: is not there; check the path")
-    _check_model(args)
-    outputs = list(_paths(args, Written))
+    _check_model(command)
+    outputs = list(_paths(command, Written))
     for option, path in outputs:
         _check_place(option, path)
-    refuse_overwriting(args, [path for _, path in inputs])
+    refuse_overwriting(command, [path for _, path in inputs])
 
 
-def refuse_overwriting(args: argparse.Namespace, inputs: Sequence[str]) -> None:
+def refuse_overwriting(command: Command, inputs: Sequence[str]) -> None:
     """Refuse outputs that are what is read, or hold it, or lie in it and are not a result of an
     earlier run.
 
     Args:
-        args: of the command; its values of the type :class:`Written` are the outputs.
+        command: of the command; its values of the type :class:`Written` are the outputs.
         inputs: paths that are read; those that are not there do not matter.
 
     Raises:
         ValueError: with the option and the path.
     """
-    outputs = list(_paths(args, Written))
+    outputs = list(_paths(command, Written))
     named: dict[str, str] = {}
     for option, path in outputs:
         place = os.path.realpath(path)
@@ -144,9 +147,9 @@ def _conflict(output: str, given: str, held: Callable[[str], set[Identity]]) -> 
     return None
 
 
-def _paths(args: argparse.Namespace, kind: type[str]) -> Iterator[tuple[str, str]]:
+def _paths(command: Command, kind: type[str]) -> Iterator[tuple[str, str]]:
     """Yield option and path of each value of a type."""
-    for name, value in vars(args).items():
+    for name, value in command.values().items():
         values = value if isinstance(value, list) else [value]
         for one in values:
             if isinstance(one, kind):
@@ -166,9 +169,9 @@ def _check_place(option: str, path: str) -> None:
         raise ValueError(f"{option} {path}: is a folder; name a file")
 
 
-def _check_model(args: argparse.Namespace) -> None:
+def _check_model(command: Command) -> None:
     """Raise ValueError where what is given as a model is none."""
-    model = getattr(args, "model", None)
+    model = command.values().get("model")
     manifest = os.path.join(model or "", "manifest.json")
     if model is not None and not is_bundle(model) and not os.path.isfile(manifest):
         raise ValueError(
@@ -177,9 +180,9 @@ def _check_model(args: argparse.Namespace) -> None:
         )
 
 
-def _check_bundle(args: argparse.Namespace) -> None:
+def _check_bundle(command: Command) -> None:
     """Raise ValueError where what is given as a bundle is none."""
-    bundle = getattr(args, "bundle", None)
+    bundle = command.values().get("bundle")
     if bundle is not None and not is_bundle(bundle):
         what = (
             "expected a bundle, a folder with bundle.json; adaptfault train --out X.bundle"

@@ -3,103 +3,87 @@ bundle runs."""
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from adaptfault.cli.options import (
-    Commands,
-    add_device,
-    add_recordings,
-    add_trust,
-    command,
-    device,
-    emit,
-    load_recordings,
-)
+from adaptfault.cli.command import option
 from adaptfault.cli.paths import Read
+from adaptfault.cli.reading import Reading
+from adaptfault.cli.shared_options import Trusting, chosen_device, device_option
 
 if TYPE_CHECKING:
     from adaptfault.cli.trained_model import TrainedModel
     from adaptfault.data.recordings import Recordings
     from adaptfault.data.windows import Windows
 
-_EXAMPLE = """  adaptfault predict today/ --bundle robot.bundle
+
+class Predict(Trusting, Reading):
+    """Name the class or the values of each recording."""
+
+    example = """  adaptfault predict today/ --bundle robot.bundle
       the version that the robot runs: faulty cells are not used
   adaptfault predict today/ --model model --json"""
+    one_of = ("model", "bundle")
+    one_is_needed = True
 
+    model: Read | None = option("folder written by adaptfault train", "MODEL")
+    bundle: Read | None = option("the robot's bundle", "BUNDLE")
+    device: str = device_option()
 
-def add(commands: Commands) -> None:
-    """Add the command."""
-    parser = command(
-        commands, "predict", "name the class or the values of each recording", _EXAMPLE
-    )
-    add_recordings(parser)
-    which = parser.add_mutually_exclusive_group(required=True)
-    which.add_argument(
-        "--model", type=Read, metavar="MODEL", help="folder written by adaptfault train"
-    )
-    which.add_argument("--bundle", type=Read, metavar="BUNDLE", help="the robot's bundle")
-    add_device(parser)
-    add_trust(parser)
-    parser.set_defaults(run=run)
+    def run(self) -> int:
+        """Predict; the probabilities of a recording are those of
+        :func:`adaptfault.evaluation.scores.of_recording`, its values the mean over its windows."""
+        import numpy as np
 
+        from adaptfault.cli.trained_model import TrainedModel
+        from adaptfault.data.windows import make_windows
+        from adaptfault.evaluation.scores import of_recording
 
-def run(args: argparse.Namespace) -> int:
-    """Predict; the probabilities of a recording are those of
-    :func:`adaptfault.evaluation.scores.of_recording`, its values the mean over its windows."""
-    import numpy as np
-
-    from adaptfault.cli.trained_model import TrainedModel
-    from adaptfault.data.windows import make_windows
-    from adaptfault.evaluation.scores import of_recording
-
-    trained = TrainedModel.open(args, args.model or args.bundle)
-    if args.calibration is None and trained.calibration is not None:
-        args.calibration = trained.calibration
-    recordings = trained.rewired(
-        load_recordings(args, args.recordings, layout=trained.network.layout)
-    )
-    windows = make_windows(
-        recordings.frames, None, recordings.layout, length=trained.network.length
-    )
-    trained.adaptation.model.to(device(args))
-    if trained.is_regression:
-        return _values(args, trained, recordings, windows)
-    probabilities = trained.adaptation.predict_proba(windows.x)
-    names = trained.class_names or tuple(f"class {i}" for i in range(probabilities.shape[1]))
-    results = []
-    for i, name in enumerate(recordings.names):
-        own = probabilities[windows.recording == i]
-        mean = of_recording(own) if len(own) else None
-        results.append(
-            {
-                "recording": name,
-                "class": None if mean is None else names[int(mean.argmax())],
-                "probability": None if mean is None else float(mean.max()),
-                "windows": len(own),
-                "agreeing_windows": 0
-                if mean is None
-                else int(np.sum(own.argmax(axis=1) == mean.argmax())),
-                "label": None
-                if recordings.labels is None
-                else recordings.class_names[recordings.labels[i]],
-            }
+        trained = TrainedModel.open(self, str(self.model or self.bundle))
+        if self.calibration is None and trained.calibration is not None:
+            self.calibration = trained.calibration
+        recordings = trained.rewired(self.load(self.recordings, layout=trained.network.layout))
+        windows = make_windows(
+            recordings.frames, None, recordings.layout, length=trained.network.length
         )
-    result = {
-        "schema": "adaptfault.predict/1",
-        "layout": recordings.layout.to_dict(),
-        "class_names": list(names),
-        "fault_set": list(trained.adaptation.fault_set),
-        "predictions": results,
-    }
-    emit(args, result, _table(results))
-    return 0
+        trained.adaptation.model.to(chosen_device(self.device))
+        if trained.is_regression:
+            return _values(self, trained, recordings, windows)
+        probabilities = trained.adaptation.predict_proba(windows.x)
+        names = trained.class_names or tuple(f"class {i}" for i in range(probabilities.shape[1]))
+        results = []
+        for i, name in enumerate(recordings.names):
+            own = probabilities[windows.recording == i]
+            mean = of_recording(own) if len(own) else None
+            results.append(
+                {
+                    "recording": name,
+                    "class": None if mean is None else names[int(mean.argmax())],
+                    "probability": None if mean is None else float(mean.max()),
+                    "windows": len(own),
+                    "agreeing_windows": 0
+                    if mean is None
+                    else int(np.sum(own.argmax(axis=1) == mean.argmax())),
+                    "label": None
+                    if recordings.labels is None
+                    else recordings.class_names[recordings.labels[i]],
+                }
+            )
+        result = {
+            "schema": "adaptfault.predict/1",
+            "layout": recordings.layout.to_dict(),
+            "class_names": list(names),
+            "fault_set": list(trained.adaptation.fault_set),
+            "predictions": results,
+        }
+        self.emit(result, _table(results))
+        return 0
 
 
-def _values(
-    args: argparse.Namespace, trained: TrainedModel, recordings: Recordings, windows: Windows
-) -> int:
+add = Predict.add
+
+
+def _values(args: Predict, trained: TrainedModel, recordings: Recordings, windows: Windows) -> int:
     """Print the values of each recording."""
     predicted = trained.adaptation.predict(windows.x)
     names = trained.class_names or tuple(f"value {i}" for i in range(predicted.shape[1]))
@@ -125,7 +109,7 @@ def _values(
             else [*(f"{value:.4g}" for value in one["values"]), str(one["windows"])]
         )
         rows.append((one["recording"], *shown, *[""] * (len(names) + 1 - len(shown))))
-    emit(args, result, _aligned(rows))
+    args.emit(result, _aligned(rows))
     return 0
 
 

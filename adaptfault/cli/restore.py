@@ -2,112 +2,90 @@
 
 from __future__ import annotations
 
-import argparse
 import json
 from pathlib import Path
 
-from adaptfault.cli.options import Commands, add_trust, command, emit, report_problems, say, trust
-from adaptfault.cli.paths import Read, Stated, written_into
+from adaptfault.cli.command import argument, option
+from adaptfault.cli.paths import Read, Stated, WrittenInto, written_into
+from adaptfault.cli.shared_options import Trusting
 
 _RESTORED = "restored.npz"
 _ABOUT = "restored.json"
 
-_EXAMPLE = """  adaptfault restore today/ --bundle robot.bundle --out restored/
+
+class Restore(Trusting):
+    """Replace faulty cells by estimates from the healthy ones."""
+
+    example = """  adaptfault restore today/ --bundle robot.bundle --out restored/
       writes restored.npz, readable by every command,
       and restored.json with the deviation of each restored cell
   adaptfault restore today/ --bundle robot.bundle --out restored/ --faults 3,17,200"""
 
+    recordings: list[Read] = argument("file or folder of recordings", "RECORDINGS")
+    bundle: Read = option("folder with the healthy windows of the array", "BUNDLE", required=True)
+    out: WrittenInto = option(
+        "folder to write", "FOLDER", required=True, type=written_into(_RESTORED, _ABOUT)
+    )
+    faults: Stated | None = option(
+        "a diagnosis (JSON), or cell indices as 3,17,200 (default: the faulty cells that the"
+        " bundle lists)",
+        "F",
+    )
 
-def add(commands: Commands) -> None:
-    """Add the command."""
-    parser = command(
-        commands, "restore", "replace faulty cells by estimates from the healthy ones", _EXAMPLE
-    )
-    parser.add_argument(
-        "recordings",
-        type=Read,
-        nargs="+",
-        metavar="RECORDINGS",
-        help="file or folder of recordings",
-    )
-    parser.add_argument(
-        "--bundle",
-        type=Read,
-        required=True,
-        metavar="BUNDLE",
-        help="folder with the healthy windows of the array",
-    )
-    parser.add_argument(
-        "--out",
-        type=written_into(_RESTORED, _ABOUT),
-        required=True,
-        metavar="FOLDER",
-        help="folder to write",
-    )
-    parser.add_argument(
-        "--faults",
-        type=Stated,
-        metavar="F",
-        help=(
-            "a diagnosis (JSON), or cell indices as 3,17,200 (default: the faulty cells that the"
-            " bundle lists)"
-        ),
-    )
-    add_trust(parser)
-    parser.set_defaults(run=run)
+    def run(self) -> int:
+        """Restore the faulty cells and missing readings of each recording."""
+        import numpy as np
+
+        from adaptfault.bundle.bundle import Bundle
+        from adaptfault.cli.diagnoses import fault_set
+        from adaptfault.data.atomic import atomic_write
+        from adaptfault.data.recordings import Recordings, save_npz
+        from adaptfault.robot.new_recordings import load_new_recordings
+
+        bundle = Bundle.open(self.bundle, **self.trusted())
+        layout = bundle.layout
+        faults = (
+            bundle.known_faults().fault_set
+            if self.faults is None
+            else fault_set(self.faults, layout)
+        )
+        incoming = load_new_recordings(bundle, self.recordings)
+        self.tell_problems(incoming.problems)
+        self.say(
+            f"{len(faults)} of {layout.present.sum()} cells are faulty; restoring"
+            f" {len(incoming.frames)} recordings"
+        )
+        restorer = bundle.restorer()
+        version = bundle.active()  # wires are put back and pads recalibrated, as it does
+        given = [version.undo(layout.check_recording(frames)) for frames in incoming.frames]
+        restored = [restorer.transform(frames, faults).astype(np.float32) for frames in given]
+        missing = sum(int(np.isnan(frames[:, faults.healthy]).sum()) for frames in given)
+        deviation = restorer.deviation(faults)
+        folder = Path(self.out)
+        folder.mkdir(parents=True, exist_ok=True)
+        save_npz(folder / _RESTORED, Recordings(tuple(restored), layout, names=incoming.names))
+        result = {
+            "schema": "adaptfault.restore/1",
+            "recordings": len(restored),
+            "fault_set": list(faults),
+            "unit": layout.unit,
+            "deviation": {str(cell): float(deviation[cell]) for cell in faults},
+            "missing_readings": missing,
+            "restored": str(folder / _RESTORED),
+        }
+        about = json.dumps(result, indent=1, allow_nan=False)
+        atomic_write(folder / _ABOUT, about.encode())
+        typical = (
+            f", typical deviation {np.median(deviation[list(faults)]):.3g} {layout.unit}"
+            if len(faults)
+            else ""
+        )
+        self.emit(
+            result,
+            f"{len(restored)} recordings: {len(faults)} cells and {missing} other missing readings"
+            f" restored{typical}\nrestored recordings: {folder / 'restored.npz'}",
+        )
+        return 0
 
 
-def run(args: argparse.Namespace) -> int:
-    """Restore the faulty cells and missing readings of each recording."""
-    import numpy as np
-
-    from adaptfault.bundle.bundle import Bundle
-    from adaptfault.cli.options import fault_set
-    from adaptfault.data.atomic import atomic_write
-    from adaptfault.data.recordings import Recordings, save_npz
-    from adaptfault.robot.new_recordings import load_new_recordings
-
-    bundle = Bundle.open(args.bundle, **trust(args))
-    layout = bundle.layout
-    faults = (
-        bundle.known_faults().fault_set if args.faults is None else fault_set(args.faults, layout)
-    )
-    incoming = load_new_recordings(bundle, args.recordings)
-    report_problems(args, incoming.problems)
-    say(
-        args,
-        f"{len(faults)} of {layout.present.sum()} cells are faulty; restoring"
-        f" {len(incoming.frames)} recordings",
-    )
-    restorer = bundle.restorer()
-    version = bundle.active()  # wires are put back and pads recalibrated, as it does
-    given = [version.undo(layout.check_recording(frames)) for frames in incoming.frames]
-    restored = [restorer.transform(frames, faults).astype(np.float32) for frames in given]
-    missing = sum(int(np.isnan(frames[:, faults.healthy]).sum()) for frames in given)
-    deviation = restorer.deviation(faults)
-    folder = Path(args.out)
-    folder.mkdir(parents=True, exist_ok=True)
-    save_npz(folder / _RESTORED, Recordings(tuple(restored), layout, names=incoming.names))
-    result = {
-        "schema": "adaptfault.restore/1",
-        "recordings": len(restored),
-        "fault_set": list(faults),
-        "unit": layout.unit,
-        "deviation": {str(cell): float(deviation[cell]) for cell in faults},
-        "missing_readings": missing,
-        "restored": str(folder / _RESTORED),
-    }
-    about = json.dumps(result, indent=1, allow_nan=False)
-    atomic_write(folder / _ABOUT, about.encode())
-    typical = (
-        f", typical deviation {np.median(deviation[list(faults)]):.3g} {layout.unit}"
-        if len(faults)
-        else ""
-    )
-    emit(
-        args,
-        result,
-        f"{len(restored)} recordings: {len(faults)} cells and {missing} other missing readings"
-        f" restored{typical}\nrestored recordings: {folder / 'restored.npz'}",
-    )
-    return 0
+add = Restore.add

@@ -2,28 +2,25 @@
 
 from __future__ import annotations
 
-import argparse
 from typing import TYPE_CHECKING
 
+from adaptfault.cli.command import Command, option
 from adaptfault.cli.inject_option import INJECT_HELP, parse_faults
 
 if TYPE_CHECKING:
     from adaptfault.data.recordings import Recordings
 
 
-def add_selection(parser: argparse.ArgumentParser) -> None:
-    """Add the options."""
-    parser.add_argument(
-        "--take", metavar="SLICE", help="only these recordings, as a Python slice: 0:100, ::5"
-    )
-    parser.add_argument("--leave", metavar="SLICE", help="all recordings but these")
-    parser.add_argument("--inject", action="append", default=[], metavar="FAULT", help=INJECT_HELP)
-    parser.add_argument(
-        "--fault-seed", type=int, default=0, metavar="N", help="random seed of faults (default 0)"
-    )
+class Selecting(Command):
+    """The options."""
+
+    take: str | None = option("only these recordings, as a Python slice: 0:100, ::5", "SLICE")
+    leave: str | None = option("all recordings but these", "SLICE")
+    inject: list[str] = option(INJECT_HELP, "FAULT", action="append", default=[])
+    fault_seed: int = option("random seed of faults (default 0)", "N", default=0)
 
 
-def select(args: argparse.Namespace, recordings: Recordings) -> Recordings:
+def select(args: Selecting, recordings: Recordings) -> Recordings:
     """Return the selected recordings, with the faults injected.
 
     Raises:

@@ -6,16 +6,19 @@ read it.
 
 from __future__ import annotations
 
-import argparse
 import io
+import logging
 import os
 import sys
 from collections.abc import Callable
 from contextlib import suppress
-from typing import Any, TextIO
+from typing import TYPE_CHECKING, Any, TextIO
 
 from adaptfault.data.printable import printable
 from adaptfault.data.shortage import is_shortage
+
+if TYPE_CHECKING:
+    from adaptfault.cli.command import Command
 
 _STREAMS = ("stdin", "stdout", "stderr")
 _LONGEST = 2000  # characters of an error
@@ -70,22 +73,42 @@ def one_line(error: BaseException) -> str:
     return f"not enough memory ({text})" if text else "not enough memory"
 
 
-def tell(args: argparse.Namespace, text: str) -> None:
+def above_bars(text: str) -> None:
+    """Print on stderr, above a progress bar if one is shown."""
+    text = printable(text)
+    if "tqdm" in sys.modules:
+        from tqdm import tqdm
+
+        tqdm.write(text, file=sys.stderr)
+    else:
+        print(text, file=sys.stderr, flush=True)
+
+
+class LogAboveBars(logging.Handler):
+    """Prints warnings of the library as commands print steps: a line of its own, above a progress
+    bar."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Print a message."""
+        above_bars(self.format(record))
+
+
+def tell(command: Command, text: str) -> None:
     """Print on stdout; nobody may read it any more."""
-    _attempt(args, lambda: print(text, flush=True))
+    _attempt(command, lambda: print(text, flush=True))
 
 
-def finish(args: argparse.Namespace, code: int) -> int:
+def finish(command: Command, code: int) -> int:
     """Return the exit code of a command whose result was printed, or could not be.
 
     A command that decides something for a robot has done so: its code still says what, as a
     warning.
     """
     with suppress(ValueError):  # closed
-        _attempt(args, sys.stdout.flush)
-    if not getattr(args, "untold", False):
+        _attempt(command, sys.stdout.flush)
+    if not command.untold:
         return code
-    return max(code, 1 if getattr(args, "decides", False) else 3)
+    return max(code, 1 if command.decides else 3)
 
 
 def settle() -> None:
@@ -112,19 +135,17 @@ def is_unread(error: BaseException) -> bool:
     return False
 
 
-def _attempt(args: argparse.Namespace, write: Callable[[], None]) -> None:
+def _attempt(command: Command, write: Callable[[], None]) -> None:
     """Write on stdout; what is still printed after an error vanishes."""
     try:
         write()
     except BrokenPipeError:
         _discard(sys.stdout)
     except OSError as error:
-        args.untold = True
+        command.untold = True
         _discard(sys.stdout)
-        print(
-            f"adaptfault {args.command}: error: the result could not be printed: {error.strerror}",
-            file=sys.stderr,
-        )
+        what = f"the result could not be printed: {error.strerror}"
+        print(f"adaptfault {command.command}: error: {what}", file=sys.stderr)
 
 
 def _discard(stream: TextIO) -> None:

@@ -2,29 +2,18 @@
 
 from __future__ import annotations
 
-import argparse
 import math
 import shutil
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
-from adaptfault.cli.options import (
-    Commands,
-    add_device,
-    add_recordings,
-    add_sign,
-    command,
-    device,
-    emit,
-    fit_diagnoser,
-    load_recordings,
-    progress,
-    say,
-    warn_of_reference,
-)
-from adaptfault.cli.paths import WrittenFolder, is_bundle
+from adaptfault.cli.command import option
+from adaptfault.cli.fitting import fit_diagnoser, warn_of_reference
+from adaptfault.cli.paths import Read, WrittenFolder, is_bundle
+from adaptfault.cli.reading import Reading
+from adaptfault.cli.shared_options import chosen_device, device_option, sign_option
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -42,153 +31,132 @@ if TYPE_CHECKING:
 _SOON = 3  # epochs after which a training should be above chance
 _CHECKPOINT = "training.safetensors"
 
-_EXAMPLE = """  adaptfault train grasps/ --out model --epochs 20
+
+class Train(Reading):
+    """Train the paper's network on fault-free recordings."""
+
+    takes_targets = True
+    example = """  adaptfault train grasps/ --out model --epochs 20
       grasps/<class>/<recording>.csv; after a crash the same command continues the training
   adaptfault train grasps/ --out robot.bundle
       the folder that a robot carries: for adaptfault maintain and listen
   adaptfault train grasps/ --targets targets.csv --out model
       a regression; targets.csv: file,force,row,column"""
+    continues = True
 
-
-def add(commands: Commands) -> None:
-    """Add the command."""
-    parser = command(
-        commands, "train", "train the paper's network on fault-free recordings", _EXAMPLE
+    out: WrittenFolder = option("where the model goes; X.bundle: a bundle", "FOLDER", required=True)
+    epochs: int = option("at most so many epochs (default 50)", default=50)
+    learning_rate: float = option(
+        "of Adam (default 1e-4; small models need more)", "X", default=1e-4
     )
-    add_recordings(parser, targets=True)
-    parser.add_argument(
-        "--out",
-        type=WrittenFolder,
-        required=True,
-        metavar="FOLDER",
-        help="where the model goes; X.bundle: a bundle",
+    seed: int = option("random seed of split, weights and training (default 0)", default=0)
+    length: int = option("frames in a window (default 10)", default=10)
+    repairable: bool = option(
+        "remove random cells while training: imputation alone then repairs more; needs about"
+        " twice the epochs"
     )
-    parser.add_argument(
-        "--epochs", type=int, default=50, help="at most so many epochs (default 50)"
-    )
-    parser.add_argument(
-        "--learning-rate",
-        type=float,
-        default=1e-4,
-        metavar="X",
-        help="of Adam (default 1e-4; small models need more)",
-    )
-    parser.add_argument(
-        "--seed", type=int, default=0, help="random seed of split, weights and training (default 0)"
-    )
-    parser.add_argument("--length", type=int, default=10, help="frames in a window (default 10)")
-    parser.add_argument(
-        "--repairable",
-        action="store_true",
-        help=(
-            "remove random cells while training: imputation alone then repairs more; needs about"
-            " twice the epochs"
-        ),
-    )
-    parser.add_argument(
-        "--head",
+    head: Literal["auto", "linear"] = option(
+        "auto: after training, a head in closed form where it improves validation (default);"
+        " linear: the network alone, as in the paper",
         default="auto",
-        choices=("auto", "linear"),
-        help=(
-            "auto: after training, a head in closed form where it improves validation (default);"
-            " linear: the network alone, as in the paper"
-        ),
     )
-    parser.add_argument(
-        "--strict",
-        action="store_true",
-        help="exit code 1 if recordings show faults, or the training a sign of failure",
+    strict: bool = option(
+        "exit code 1 if recordings show faults, or the training a sign of failure"
     )
-    parser.add_argument(
-        "--model",
-        dest="builder",
-        metavar="PACKAGE:FUNCTION",
-        help=(
-            "train the torch module that this function returns for (layout, n_classes, length)"
-            " (default: the paper's network)"
-        ),
+    builder: str | None = option(
+        "train the torch module that this function returns for (layout, n_classes, length)"
+        " (default: the paper's network)",
+        "PACKAGE:FUNCTION",
+        flag="--model",
     )
-    add_sign(parser, "X.bundle")
-    add_device(parser)
-    parser.set_defaults(run=run, continues=True)
+    sign: Read | None = sign_option("X.bundle")
+    device: str = device_option()
 
+    def run(self) -> int:
+        """Train, evaluate on the test recordings, save."""
+        out = Path(self.out)
+        bundled = out.suffix == ".bundle"
+        if bundled and _was_done(self, out):
+            return 0
+        _check_options(self, out, bundled)
+        recordings = self.load(self.recordings, labelled=True)
+        where = chosen_device(self.device)
+        if _shows_faults(recordings) and self.strict:
+            return 1
 
-def run(args: argparse.Namespace) -> int:
-    """Train, evaluate on the test recordings, save."""
-    out = Path(args.out)
-    bundled = out.suffix == ".bundle"
-    if bundled and _was_done(args, out):
-        return 0
-    _check_options(args, out, bundled)
-    recordings = load_recordings(args, args.recordings, labelled=True)
-    where = device(args)
-    if _shows_faults(recordings) and args.strict:
-        return 1
+        from adaptfault.adaptation.adapter import Adapter
+        from adaptfault.cli.trained_model import say_short
+        from adaptfault.data.windows import make_windows, split
+        from adaptfault.evaluation.scores import Scores, ValueScores
+        from adaptfault.models.network import TactileTransformer
+        from adaptfault.models.store import save_model
+        from diagnostics import FaultSet
 
-    from adaptfault.adaptation.adapter import Adapter
-    from adaptfault.cli.trained_model import say_short
-    from adaptfault.data.windows import make_windows, split
-    from adaptfault.evaluation.scores import Scores, ValueScores
-    from adaptfault.models.network import TactileTransformer
-    from adaptfault.models.store import save_model
-    from diagnostics import FaultSet
-
-    values = recordings.targets is not None
-    names = recordings.value_names if values else recordings.class_names
-    _check_classes(args.recordings[0], recordings)
-    windows = make_windows(
-        recordings.frames,
-        recordings.targets if values else recordings.labels,
-        recordings.layout,
-        length=args.length,
-    )
-    parts = split(windows, seed=args.seed)
-    say(args, f"{recordings.layout}; {windows}")
-    say_short(args, recordings, args.length)
-    n_classes = len(names)
-    units = _units(args, names, parts[0]) if values else None
-    model: TactileTransformer | AnyModel
-    if args.builder:
-        model = _built(args.builder, windows, recordings.layout, n_classes, values)
-    else:
-        model = TactileTransformer(recordings.layout, n_classes, length=args.length, seed=args.seed)
-    folder = _training_folder(out) if bundled else out
-    history = _trained(args, model.to(where), parts, folder, units)
-    adapter = Adapter(model.cpu(), parts[0], parts[1])
-    healthy = (
-        adapter.healthy
-        if args.head == "auto"
-        else adapter.adapt(FaultSet((), model.layout.n_cells), method="fill")
-    )
-    predicted = healthy.predict(parts[2].x)
-    scores: Scores | ValueScores
-    if units is None:
-        scores = Scores.of(parts[2].y, predicted, n_classes=n_classes)
-    else:
-        scores = ValueScores.of(parts[2].y, predicted)
-    extra = {"split_seed": args.seed, "test_scores": scores.to_dict(), "history": history.to_dict()}
-    if units is not None:
-        extra["units"] = units.to_dict(names)
-    if bundled:
-        _bundle(args, out, recordings, adapter, parts, names)
-        shutil.rmtree(folder)
-    else:
-        save_model(
-            out,
-            model,
-            class_names=names,
-            extra=extra,
-            head=healthy.model.head,
-            task=adapter.task,
+        values = recordings.targets is not None
+        names = recordings.value_names if values else recordings.class_names
+        _check_classes(self.recordings[0], recordings)
+        windows = make_windows(
+            recordings.frames,
+            recordings.targets if values else recordings.labels,
+            recordings.layout,
+            length=self.length,
         )
-        (folder / _CHECKPOINT).unlink()  # the run is complete: nothing is left to resume
-    if isinstance(scores, Scores) and recordings.labels is not None:
-        from adaptfault.evaluation.training_check import rest_level_note
+        parts = split(windows, seed=self.seed)
+        self.say(f"{recordings.layout}; {windows}")
+        say_short(self, recordings, self.length)
+        n_classes = len(names)
+        units = _units(self, names, parts[0]) if values else None
+        model: TactileTransformer | AnyModel
+        if self.builder:
+            model = _built(self.builder, windows, recordings.layout, n_classes, values)
+        else:
+            model = TactileTransformer(
+                recordings.layout, n_classes, length=self.length, seed=self.seed
+            )
+        folder = _training_folder(out) if bundled else out
+        history = _trained(self, model.to(where), parts, folder, units)
+        adapter = Adapter(model.cpu(), parts[0], parts[1])
+        healthy = (
+            adapter.healthy
+            if self.head == "auto"
+            else adapter.adapt(FaultSet((), model.layout.n_cells), method="fill")
+        )
+        predicted = healthy.predict(parts[2].x)
+        scores: Scores | ValueScores
+        if units is None:
+            scores = Scores.of(parts[2].y, predicted, n_classes=n_classes)
+        else:
+            scores = ValueScores.of(parts[2].y, predicted)
+        extra = {
+            "split_seed": self.seed,
+            "test_scores": scores.to_dict(),
+            "history": history.to_dict(),
+        }
+        if units is not None:
+            extra["units"] = units.to_dict(names)
+        if bundled:
+            _bundle(self, out, recordings, adapter, parts, names)
+            shutil.rmtree(folder)
+        else:
+            save_model(
+                out,
+                model,
+                class_names=names,
+                extra=extra,
+                head=healthy.model.head,
+                task=adapter.task,
+            )
+            (folder / _CHECKPOINT).unlink()  # the run is complete: nothing is left to resume
+        if isinstance(scores, Scores) and recordings.labels is not None:
+            from adaptfault.evaluation.training_check import rest_level_note
 
-        if note := rest_level_note(recordings.frames, recordings.labels, scores.accuracy):
-            say(args, note)
-    problems = _told(args, out, bundled, scores, history, names, extra, (parts[2].y, predicted))
-    return int(args.strict and bool(problems))
+            if note := rest_level_note(recordings.frames, recordings.labels, scores.accuracy):
+                self.say(note)
+        problems = _told(self, out, bundled, scores, history, names, extra, (parts[2].y, predicted))
+        return int(self.strict and bool(problems))
+
+
+add = Train.add
 
 
 def _shows_faults(recordings: Recordings) -> bool:
@@ -222,7 +190,7 @@ def _training_folder(out: Path) -> Path:
     return out.with_name(f".{out.name}.training")
 
 
-def _was_done(args: argparse.Namespace, out: Path) -> bool:
+def _was_done(args: Train, out: Path) -> bool:
     """Return whether a run of this command was cut off after its bundle was whole, and end it.
 
     Raises:
@@ -236,11 +204,11 @@ def _was_done(args: argparse.Namespace, out: Path) -> bool:
     Bundle.open(out, keys=None if args.sign is None else [args.sign])
     shutil.rmtree(folder)
     result = {"schema": "adaptfault.train/1", "bundle": str(out)}
-    emit(args, result, f"bundle: {out}, whole; the run that made it was cut off at its end")
+    args.emit(result, f"bundle: {out}, whole; the run that made it was cut off at its end")
     return True
 
 
-def _check_options(args: argparse.Namespace, out: Path, bundled: bool) -> None:
+def _check_options(args: Train, out: Path, bundled: bool) -> None:
     """Refuse what would fail after the training."""
     if bundled and out.exists():
         raise ValueError(f"{out} exists: choose another name, or remove it")
@@ -253,7 +221,7 @@ def _check_options(args: argparse.Namespace, out: Path, bundled: bool) -> None:
 
 
 def _trained(
-    args: argparse.Namespace,
+    args: Train,
     model: TactileTransformer | AnyModel,
     parts: tuple[Windows, Windows, Windows],
     folder: Path,
@@ -268,7 +236,7 @@ def _trained(
     folder.mkdir(parents=True, exist_ok=True)
     checkpoint = folder / _CHECKPOINT
     if checkpoint.exists():
-        say(args, f"continuing from {checkpoint}")
+        args.say(f"continuing from {checkpoint}")
     training, validation = parts[:2]
     if units is not None:
         training, validation = units.standardised(training), units.standardised(validation)
@@ -282,7 +250,7 @@ def _trained(
         repairable=args.repairable,
         checkpoint=checkpoint,
         on_epoch=_epoch_line(args, training, units),
-        progress=progress(args),
+        progress=args.progress,
     )
     if units is not None:
         units.fold(model)
@@ -290,7 +258,7 @@ def _trained(
 
 
 def _epoch_line(
-    args: argparse.Namespace, training: Windows, units: ValueUnits | None
+    args: Train, training: Windows, units: ValueUnits | None
 ) -> Callable[[History], None]:
     """Return what tells on stderr a training that is at chance after a few epochs, and each epoch
     where no bar is shown."""
@@ -303,21 +271,20 @@ def _epoch_line(
     def told(history: History) -> None:
         done = history.epochs
         if done == _SOON and max(history.validation_accuracy) < limit:
-            say(
-                args,
+            args.say(
                 f"at chance after {done} epochs: if this lasts, the classes do not differ in what"
-                " the cells read, the labels are mixed up, or a higher --learning-rate is needed",
+                " the cells read, the labels are mixed up, or a higher --learning-rate is needed"
             )
         if sys.stderr.isatty():
             return
         left = sum(history.seconds) / done * (args.epochs - done)
         reached = f"validation {measure} {history.validation_accuracy[-1]:.3f}"
-        say(args, f"epoch {done} of {args.epochs}: {reached}{guess}, about {left:.0f} s left")
+        args.say(f"epoch {done} of {args.epochs}: {reached}{guess}, about {left:.0f} s left")
 
     return told
 
 
-def _units(args: argparse.Namespace, names: Sequence[str], training: Windows) -> ValueUnits:
+def _units(args: Train, names: Sequence[str], training: Windows) -> ValueUnits:
     """Return the units of the values.
 
     Raises:
@@ -335,7 +302,7 @@ def _units(args: argparse.Namespace, names: Sequence[str], training: Windows) ->
 
 
 def _told(
-    args: argparse.Namespace,
+    args: Train,
     out: Path,
     bundled: bool,
     scores: Scores | ValueScores,
@@ -367,8 +334,7 @@ def _told(
     atomic_figure(picture, figure, dpi=120)
     for problem in problems:
         print(f"warning: {problem}", file=sys.stderr)
-    emit(
-        args,
+    args.emit(
         {
             "schema": "adaptfault.train/1",
             kind: str(out),
@@ -407,7 +373,7 @@ def _built(
 
 
 def _bundle(
-    args: argparse.Namespace,
+    args: Train,
     out: Path,
     recordings: Recordings,
     adapter: Adapter,

@@ -3,7 +3,6 @@ belong to it."""
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
@@ -11,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptfault.cli.options import load_recordings, say, trust
 from adaptfault.cli.paths import is_bundle
 from adaptfault.data.recordings import Recordings
 from adaptfault.data.windows import Windows, make_windows, split
@@ -22,6 +20,9 @@ if TYPE_CHECKING:  # a command that opens a bundle alone needs no torch
     from adaptfault.adaptation.result import Adaptation
     from adaptfault.bundle.bundle import Bundle
     from adaptfault.bundle.versions import Version
+    from adaptfault.cli.command import Command
+    from adaptfault.cli.reading import Reading
+    from adaptfault.cli.shared_options import Trusting
     from adaptfault.data.calibration import Calibration
 
 
@@ -48,11 +49,11 @@ class TrainedModel:
     version: Version | None = None
 
     @classmethod
-    def open(cls, args: argparse.Namespace, folder: str) -> TrainedModel:
+    def open(cls, args: Trusting, folder: str) -> TrainedModel:
         """Read a model or a bundle.
 
         Args:
-            args: the options of ``add_trust``.
+            args: whose signature a bundle needs.
             folder: of the model or the bundle.
 
         Raises:
@@ -82,25 +83,26 @@ class TrainedModel:
         """Whether the model predicts values."""
         return self.adaptation.task == "regression"
 
-    def recordings(self, args: argparse.Namespace, paths: Sequence[str]) -> Recordings:
+    def recordings(self, args: Reading, paths: Sequence[str]) -> Recordings:
         """Read labelled recordings in the layout of the model; of a regression, with targets.
 
         Raises:
             ValueError: they contradict the layout, the classes or the values of the model; both are
                 named.
         """
-        if self.is_regression and args.targets is None:
+        table = args.targets
+        if self.is_regression and table is None:
             names = ", ".join(self.class_names)
             raise ValueError(f"the model is a regression of {names}: give --targets TABLE")
-        if args.targets is not None and not self.is_regression:
+        if table is not None and not self.is_regression:
             raise ValueError(
                 "--targets is for a regression, and this model names classes: give --labels TABLE"
             )
         if args.calibration is None and self.calibration is not None:
             args.calibration = self.calibration
-        recordings = load_recordings(args, paths, labelled=True, layout=self.network.layout)
-        if self.is_regression:
-            return self._with_values(args.targets, recordings)
+        recordings = args.load(paths, labelled=True, layout=self.network.layout)
+        if table is not None:
+            return self._with_values(table, recordings)
         if self.class_names and recordings.class_names != self.class_names:
             recordings = self._in_order(recordings)
         return recordings
@@ -162,30 +164,29 @@ class TrainedModel:
         return split(self.windows(recordings), seed=self.split_seed or 0)
 
 
-def say_short(args: argparse.Namespace, recordings: Recordings, length: int) -> None:
+def say_short(args: Command, recordings: Recordings, length: int) -> None:
     """Say on stderr how many recordings are shorter than a window of ``length`` frames, if any
     is."""
     if short := sum(len(frames) < length for frames in recordings.frames):
         many = "is" if short == 1 else "are"
-        say(
-            args,
+        args.say(
             f"{short} of {len(recordings)} recordings {many} shorter than a window of {length}"
-            " frames: not used",
+            " frames: not used"
         )
 
 
-def open_bundle(args: argparse.Namespace, folder: str) -> Bundle | None:
+def open_bundle(args: Trusting, folder: str) -> Bundle | None:
     """Return the bundle in a folder; None if it holds something else.
 
     Args:
-        args: the options of ``add_trust``.
+        args: whose signature it needs.
         folder: of the bundle, a model, or recordings.
 
     Raises:
         FileNotFoundError, ValueError: the bundle is damaged or not signed by a trusted key; or no
         bundle, with --trust.
     """
-    trusted = trust(args)
+    trusted = args.trusted()
     if not is_bundle(folder):
         if trusted["keys"]:
             raise ValueError(f"--trust: {folder} is no bundle, and only bundles are signed")

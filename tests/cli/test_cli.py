@@ -15,7 +15,7 @@ import pytest
 from conftest import worn
 
 from adaptfault.cli import BUILT_IN, _parser, main
-from adaptfault.cli.options import LogAboveBars
+from adaptfault.cli.streams import LogAboveBars
 from adaptfault.data.recordings import Opened, Recordings, save_npz
 from adaptfault.data.simulated_grasps import simulate
 from adaptfault.data.windows import make_windows
@@ -177,7 +177,7 @@ def test_a_crash_of_a_command_is_no_verdict(home, capsys, monkeypatch):
     def crash(args):
         raise RuntimeError("a bug")
 
-    monkeypatch.setattr("adaptfault.cli.info.run", crash)
+    monkeypatch.setattr("adaptfault.cli.info.Info.run", crash)
     assert main(["info", str(home / "grasps.npz")]) == 3  # 1 would be "degraded but handled"
     said = capsys.readouterr().err
     assert "RuntimeError: a bug" in said
@@ -471,6 +471,7 @@ def numeric_options(
     for action in parser._actions:
         if isinstance(action, argparse._SubParsersAction):
             for name, of_command in action.choices.items():
+                of_command.fill()
                 yield from numeric_options(of_command, (*command, name))
         elif action.type in (int, float):
             yield (*command, action.option_strings[-1])

@@ -14,6 +14,7 @@ import pytest
 
 from adaptfault import __version__
 from adaptfault.cli import main
+from adaptfault.cli.diagnose import Diagnose
 from adaptfault.cli.diagnose import _write as write_results
 from adaptfault.data.atomic import atomic_write
 from adaptfault.data.recordings import load, save_npz
@@ -290,7 +291,7 @@ def test_a_diagnosis_stays_whole_where_the_disk_is_full(skin, tmp_path, monkeypa
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     diagnosis = SelfDiagnosis(skin.layout).diagnose(skin.frames[:1])
-    arguments = argparse.Namespace(out=str(tmp_path / "d.json"), picture=None, html=None)
+    arguments = Diagnose.of(argparse.Namespace(out=str(tmp_path / "d.json")))
     write_results(arguments, diagnosis, 0, [])
     before = (tmp_path / "d.json").read_text()
     monkeypatch.setattr(os, "fsync", full)

@@ -47,6 +47,7 @@ def commands(parser: argparse.ArgumentParser) -> dict[str, argparse.ArgumentPars
     for action in parser._actions:
         if isinstance(action, argparse._SubParsersAction):
             for name, inner in action.choices.items():
+                inner.fill()
                 further = commands(inner)
                 found |= {f"{name} {word}": one for word, one in further.items()} or {name: inner}
     return found

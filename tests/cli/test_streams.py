@@ -141,7 +141,7 @@ def test_too_little_memory_is_one_line_whichever_library_says_so(monkeypatch, ca
     def out_of_memory(*_, **__):
         raise error
 
-    monkeypatch.setattr("adaptfault.cli.simulate.layout_of", out_of_memory)
+    monkeypatch.setattr("adaptfault.cli.simulate.Simulate.stated_layout", out_of_memory)
     assert main(["simulate", "--out", "x.npz"]) == 3
     told = capsys.readouterr().err
     assert told.startswith("adaptfault simulate: error: not enough memory")
@@ -163,7 +163,7 @@ def test_what_nests_too_deep_is_one_line(monkeypatch, capsys):
     def deep(*_, **__):
         raise RecursionError("maximum recursion depth exceeded")
 
-    monkeypatch.setattr("adaptfault.cli.simulate.layout_of", deep)
+    monkeypatch.setattr("adaptfault.cli.simulate.Simulate.stated_layout", deep)
     assert main(["simulate", "--out", "x.npz"]) == 3
     assert capsys.readouterr().err.count("\n") == 1
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from adaptfault.cli import main
-from adaptfault.cli.train import _epoch_line
+from adaptfault.cli.train import Train, _epoch_line
 from adaptfault.data.windows import Windows
 from adaptfault.models.history import History
 
@@ -48,7 +48,7 @@ def test_after_an_interruption_it_says_whether_the_same_command_continues(
     def interrupted(args):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(f"adaptfault.cli.{command}.run", interrupted)
+    monkeypatch.setattr(f"adaptfault.cli.{command}.{command.title()}.run", interrupted)
     out = ["--out", str(tmp_path / "model")] if command == "train" else []
     assert main([command, str(grasps_file), *out]) == 130
     told = capsys.readouterr().err
@@ -59,7 +59,7 @@ def test_after_an_interruption_it_says_whether_the_same_command_continues(
 def test_a_training_at_chance_after_three_epochs_is_told_and_one_of_values_never_is(
     of_values, capsys
 ):
-    args = argparse.Namespace(quiet=False, epochs=5)
+    args = Train.of(argparse.Namespace(quiet=False, epochs=5))
     y = np.arange(30) % 3
     windows = Windows(np.zeros((30, 2, 4), np.float32), y, np.arange(30))
     units = object() if of_values else None

@@ -1,12 +1,12 @@
 """Keywords of ``load``: each option of the command line has its keyword, under its own name."""
 
-import argparse
+from dataclasses import fields
 
 import numpy as np
 import pytest
 from recording_files import refusal, write
 
-from adaptfault.cli.options import add_recordings
+from adaptfault.cli.reading import Reading
 from adaptfault.data.recordings import load
 
 GRID = np.arange(80.0).reshape(5, 16) % 7
@@ -21,12 +21,9 @@ def test_a_shape_is_taken_by_its_own_name_in_every_form(tmp_path, shape):
 
 
 def test_every_option_of_reading_is_a_keyword(tmp_path):
-    parser = argparse.ArgumentParser()
-    add_recordings(parser)
-    options = vars(parser.parse_args(["x"]))
-    no_keyword = {"recordings", "paths", "help"}
+    options = {one.name for one in fields(Reading) if one.metadata.get("section")}
     write(tmp_path / "a.csv", GRID)
-    for name in set(options) - no_keyword - {"shape", "layout"}:
+    for name in options - {"shape", "layout"}:
         load(tmp_path / "a.csv", shape="4x4", **{name: None})
 
 

@@ -3,112 +3,87 @@ recordings."""
 
 from __future__ import annotations
 
-import argparse
 from pathlib import Path
 
-from adaptfault.cli.options import (
-    Commands,
-    add_device,
-    add_recordings,
-    command,
-    device,
-    emit,
-    load_recordings,
-    progress,
-    say,
-)
-from adaptfault.cli.paths import WrittenFolder
+from adaptfault.cli.command import option
+from adaptfault.cli.paths import Read, WrittenFolder
+from adaptfault.cli.reading import Reading, recordings_option
+from adaptfault.cli.shared_options import chosen_device, device_option
 
-_EXAMPLE = """  adaptfault reproduce --quick
+
+class Reproduce(Reading):
+    """Repeat the paper's experiments: figures, claims, a page."""
+
+    example = """  adaptfault reproduce --quick
   adaptfault reproduce --figure 6 --recordings grasps.npz --out real
       after a crash the same command continues"""
+    one_of = ("quick", "full")
+    continues = True
 
-
-def add(commands: Commands) -> None:
-    """Add the command."""
-    parser = command(
-        commands, "reproduce", "repeat the paper's experiments: figures, claims, a page", _EXAMPLE
-    )
-    add_recordings(parser, option=True)
-    parser.add_argument(
-        "--figure",
-        type=int,
-        action="append",
+    recordings: list[Read] = recordings_option()
+    figure: list[int] | None = option(
+        "only this figure of the paper (7: its future work); may be given several times",
         choices=(2, 3, 4, 5, 6, 7),
-        help="only this figure of the paper (7: its future work); may be given several times",
+        action="append",
     )
-    size = parser.add_mutually_exclusive_group()
-    size.add_argument(
-        "--quick", action="store_true", help="about 14 minutes on two free cores (default)"
+    quick: bool = option("about 14 minutes on two free cores (default)")
+    full: bool = option("as the paper: 50 epochs, 200k samples; for a GPU")
+    seeds: list[int] | None = option("default 0 1 2")
+    grasps: int | None = option("simulated grasps of each class (default 200)")
+    epochs: int | None = option("of the fault-free network")
+    samples: list[int] | None = option(
+        "windows added in fault-aware training (--quick: 10000)", "N"
     )
-    size.add_argument(
-        "--full", action="store_true", help="as the paper: 50 epochs, 200k samples; for a GPU"
-    )
-    parser.add_argument("--seeds", type=int, nargs="+", help="default 0 1 2")
-    parser.add_argument("--grasps", type=int, help="simulated grasps of each class (default 200)")
-    parser.add_argument("--epochs", type=int, help="of the fault-free network")
-    parser.add_argument(
-        "--samples",
-        type=int,
-        nargs="+",
-        metavar="N",
-        help="windows added in fault-aware training (--quick: 10000)",
-    )
-    add_device(parser)
-    parser.add_argument(
-        "--out",
-        type=WrittenFolder,
-        default="adaptfault-paper",
-        metavar="FOLDER",
-        help="default adaptfault-paper",
-    )
-    parser.set_defaults(run=run, continues=True)
+    device: str = device_option()
+    out: WrittenFolder = option("default adaptfault-paper", "FOLDER", default="adaptfault-paper")
 
+    def run(self) -> int:
+        """Measure, draw, write the page."""
+        import sys
+        from dataclasses import replace
 
-def run(args: argparse.Namespace) -> int:
-    """Measure, draw, write the page."""
-    import sys
-    from dataclasses import replace
+        from adaptfault.paper.settings import Settings
 
-    from adaptfault.paper.settings import Settings
-
-    if args.recordings:
-        recordings, source = (
-            load_recordings(args, args.recordings, labelled=True),
-            Path(args.recordings[0]).name,
+        if self.recordings:
+            recordings, source = (
+                self.load(self.recordings, labelled=True),
+                Path(self.recordings[0]).name,
+            )
+        if self.samples and min(self.samples) < 1:
+            raise ValueError(
+                f"--samples {min(self.samples)}: fault-aware training adds 1 window or more"
+            )
+        settings = Settings.full() if self.full else Settings.quick(simulated=not self.recordings)
+        settings = replace(
+            settings,
+            seeds=tuple(self.seeds or settings.seeds),
+            grasps=self.grasps or settings.grasps,
+            epochs=self.epochs or settings.epochs,
+            samples=tuple(sorted(set(self.samples or settings.samples))),
         )
-    if args.samples and min(args.samples) < 1:
-        raise ValueError(
-            f"--samples {min(args.samples)}: fault-aware training adds 1 window or more"
+        if not self.recordings:
+            from adaptfault.data.simulated_grasps import simulate
+
+            self.say(f"simulating {settings.grasps} grasps of each class")
+            recordings = simulate(settings.grasps)
+            source = "simulated grasps"
+        self.say("loading torch")
+
+        from adaptfault.paper.run import FIGURES, reproduce
+
+        page = reproduce(
+            recordings,
+            settings,
+            Path(self.out),
+            figures=tuple(sorted(set(self.figure))) if self.figure else FIGURES,
+            source=source,
+            command=" ".join(["adaptfault", *sys.argv[1:]]),
+            device=chosen_device(self.device),
+            progress=self.progress,
+            say=self.say,
         )
-    settings = Settings.full() if args.full else Settings.quick(simulated=not args.recordings)
-    settings = replace(
-        settings,
-        seeds=tuple(args.seeds or settings.seeds),
-        grasps=args.grasps or settings.grasps,
-        epochs=args.epochs or settings.epochs,
-        samples=tuple(sorted(set(args.samples or settings.samples))),
-    )
-    if not args.recordings:
-        from adaptfault.data.simulated_grasps import simulate
+        self.emit({"schema": "adaptfault.reproduce/1", "page": str(page)}, f"page: {page}")
+        return 0
 
-        say(args, f"simulating {settings.grasps} grasps of each class")
-        recordings = simulate(settings.grasps)
-        source = "simulated grasps"
-    say(args, "loading torch")
 
-    from adaptfault.paper.run import FIGURES, reproduce
-
-    page = reproduce(
-        recordings,
-        settings,
-        Path(args.out),
-        figures=tuple(sorted(set(args.figure))) if args.figure else FIGURES,
-        source=source,
-        command=" ".join(["adaptfault", *sys.argv[1:]]),
-        device=device(args),
-        progress=progress(args),
-        say=lambda text: say(args, text),
-    )
-    emit(args, {"schema": "adaptfault.reproduce/1", "page": str(page)}, f"page: {page}")
-    return 0
+add = Reproduce.add

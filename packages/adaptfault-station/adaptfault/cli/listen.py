@@ -5,117 +5,20 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING
 
-from adaptfault.cli.options import (
-    Commands,
-    add_array,
-    add_metrics,
-    add_trust,
-    command,
-    layout_of,
-    trust,
-)
+from adaptfault.cli.command import argument, option
 from adaptfault.cli.paths import Read, Written, WrittenFolder
+from adaptfault.cli.reading import CalibratedArray
+from adaptfault.cli.shared_options import Trusting, metrics_option
 
 if TYPE_CHECKING:
     from adaptfault.acquisition import Station
 
-_EXAMPLE = """  adaptfault listen robot.bundle --port 5005 --record today/ --when contact
-      packets: device_id,timestamp,one value a cell;
-      without a bundle cells are monitored, nothing is classified
-  adaptfault listen robot.bundle --port 5005 --relay 127.0.0.1:5006
-      a consumer on port 5006 reads whole frames in the same format:
-      faulty cells are restored from the healthy ones
-  adaptfault listen robot.bundle --port 5005 --view today.mcap
-      frames, restored frames, states and faults as adaptfault view writes them;
-      --view rerun serves them to: rerun rerun+http://127.0.0.1:9876/proxy
-      on stdin: record, stop, auto (as --when states), quit"""
 
 _WHEN = (
     "always | command (on stdin) | contact or contact:X (cells above X in the array's unit, default"
     " 5 %% of full scale) | HH:MM-HH:MM (local time); default contact"
 )
 _DEVICE = "listen to this one only, ID or ID@ADDRESS; may be repeated"
-
-
-def add(commands: Commands) -> None:
-    """Add the command."""
-    parser = command(
-        commands,
-        "listen",
-        "monitor, classify and record frames that sensors send over UDP",
-        _EXAMPLE,
-    )
-    parser.add_argument(
-        "bundle",
-        type=Read,
-        nargs="?",
-        metavar="BUNDLE",
-        help="the robot's bundle, to classify as well",
-    )
-    parser.add_argument(
-        "--port", type=int, required=True, help="UDP port; 0 takes a free one and prints it"
-    )
-    parser.add_argument(
-        "--host",
-        default="127.0.0.1",
-        help="address to listen on; 0.0.0.0: the whole network (default: this machine only)",
-    )
-    parser.add_argument("--device", action="append", metavar="ID", help=_DEVICE)
-    parser.add_argument(
-        "--key",
-        type=Read,
-        metavar="FILE",
-        help="accept only packets that are authenticated with this key",
-    )
-    parser.add_argument(
-        "--ticks",
-        type=_ticks,
-        default=1000.0,
-        metavar="UNIT",
-        help="unit of the time stamps: s, ms, us, ns, or ticks a second (default ms)",
-    )
-    parser.add_argument(
-        "--accumulate",
-        action="store_true",
-        help="tell the class of a whole contact, not of each window; needs BUNDLE",
-    )
-    parser.add_argument(
-        "--sets",
-        type=float,
-        metavar="ALPHA",
-        help="tell the set of classes of each window, too, that holds the true one with"
-        " probability 1 - ALPHA; needs BUNDLE",
-    )
-    parser.add_argument(
-        "--record", type=WrittenFolder, metavar="FOLDER", help="record into this folder, CSV"
-    )
-    parser.add_argument(
-        "--relay",
-        metavar="HOST:PORT",
-        help="send repaired packets on; restored values have a plus sign; needs BUNDLE",
-    )
-    parser.add_argument(
-        "--view",
-        type=Written,
-        metavar="FILE",
-        help="show all frames: FILE.mcap for Foxglove, FILE.rrd for Rerun, or rerun (rerun:PORT)"
-        " to serve live viewers of Rerun",
-    )
-    parser.add_argument("--when", metavar="WHEN", help=_WHEN)
-    parser.add_argument("--seconds", type=float, metavar="S", help="end after so long")
-    parser.add_argument("--frames", type=int, metavar="N", help="end after so many frames")
-    add_metrics(parser)
-    add_array(parser)
-    add_trust(parser)
-    parser.set_defaults(run=run)
-
-
-def run(args: argparse.Namespace) -> int:
-    """Listen until the end that the options or stdin give; files are closed in any case."""
-    import asyncio
-
-    asyncio.run(_station(args).listen())
-    return 0
 
 
 def _ticks(text: str) -> float:
@@ -129,7 +32,66 @@ def _ticks(text: str) -> float:
         ) from None
 
 
-def _station(args: argparse.Namespace) -> Station:
+class Listen(Trusting, CalibratedArray):
+    """Monitor, classify and record frames that sensors send over UDP."""
+
+    example = """  adaptfault listen robot.bundle --port 5005 --record today/ --when contact
+      packets: device_id,timestamp,one value a cell;
+      without a bundle cells are monitored, nothing is classified
+  adaptfault listen robot.bundle --port 5005 --relay 127.0.0.1:5006
+      a consumer on port 5006 reads whole frames in the same format:
+      faulty cells are restored from the healthy ones
+  adaptfault listen robot.bundle --port 5005 --view today.mcap
+      frames, restored frames, states and faults as adaptfault view writes them;
+      --view rerun serves them to: rerun rerun+http://127.0.0.1:9876/proxy
+      on stdin: record, stop, auto (as --when states), quit"""
+
+    bundle: Read | None = argument("the robot's bundle, to classify as well", "BUNDLE", nargs="?")
+    port: int = option("UDP port; 0 takes a free one and prints it", required=True)
+    host: str = option(
+        "address to listen on; 0.0.0.0: the whole network (default: this machine only)",
+        default="127.0.0.1",
+    )
+    device: list[str] | None = option(_DEVICE, "ID", action="append")
+    key: Read | None = option("accept only packets that are authenticated with this key", "FILE")
+    ticks: float = option(
+        "unit of the time stamps: s, ms, us, ns, or ticks a second (default ms)",
+        "UNIT",
+        default=1000.0,
+        type=_ticks,
+    )
+    accumulate: bool = option("tell the class of a whole contact, not of each window; needs BUNDLE")
+    sets: float | None = option(
+        "tell the set of classes of each window, too, that holds the true one with"
+        " probability 1 - ALPHA; needs BUNDLE",
+        "ALPHA",
+    )
+    record: WrittenFolder | None = option("record into this folder, CSV", "FOLDER")
+    relay: str | None = option(
+        "send repaired packets on; restored values have a plus sign; needs BUNDLE", "HOST:PORT"
+    )
+    view: Written | None = option(
+        "show all frames: FILE.mcap for Foxglove, FILE.rrd for Rerun, or rerun (rerun:PORT)"
+        " to serve live viewers of Rerun",
+        "FILE",
+    )
+    when: str | None = option(_WHEN, "WHEN")
+    seconds: float | None = option("end after so long", "S")
+    frames: int | None = option("end after so many frames", "N")
+    metrics: Written | None = metrics_option()
+
+    def run(self) -> int:
+        """Listen until the end that the options or stdin give; files are closed in any case."""
+        import asyncio
+
+        asyncio.run(_station(self).listen())
+        return 0
+
+
+add = Listen.add
+
+
+def _station(args: Listen) -> Station:
     from adaptfault.acquisition import Station, read_key
     from adaptfault.data.calibration import Calibration
 
@@ -152,17 +114,17 @@ def _station(args: argparse.Namespace) -> Station:
     elif args.bundle:
         from adaptfault.bundle.bundle import Bundle
 
-        tables = Bundle.open(args.bundle, **trust(args)).parts.calibration
+        tables = Bundle.open(args.bundle, **args.trusted()).parts.calibration
     layout = (
-        layout_of(args)
+        args.stated_layout()
         if tables is None
-        else layout_of(args, full_scale=tables.full_scale, unit="N")
+        else args.stated_layout(full_scale=tables.full_scale, unit="N")
     )
     return Station(
         None if args.bundle else layout,
         args.port,
         bundle=args.bundle,
-        **trust(args),
+        **args.trusted(),
         host=args.host,
         devices=args.device,
         ticks=args.ticks,

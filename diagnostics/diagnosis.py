@@ -61,7 +61,7 @@ from diagnostics.preprocessing.load import LoadDirection
 from diagnostics.preprocessing.quantiles import known_quantile
 from diagnostics.preprocessing.readings import RecordingBlocks
 from diagnostics.sensor.crosstalk import Crosstalk, find_crosstalk, lowest_floors
-from diagnostics.sensor.gain import gain_of, loads_of, without_gain
+from diagnostics.sensor.gain import UsualSizes, without_gain
 from diagnostics.sensor.odd_frames import evenly
 from diagnostics.sensor.rewiring import Rewiring, find_rewiring
 from diagnostics.sensor.shared import Shared, measured
@@ -266,9 +266,9 @@ class SelfDiagnosis:
             dead = np.where(never_moved(healthy, tolerance), suspected[self._order], 0.0)
         self.reference_ = Reference.fit(healthy, layout, dead)
         near = self.reference_.scale.near
-        usual = loads_of(healthy, near, living(layout, dead).present.ravel())
+        usual = UsualSizes.of(list(healthy), near, living(layout, dead).present.ravel())
         floors = lowest_floors(healthy, self.reference_.scale.baseline, living(layout, dead))
-        self.reference_ = replace(self.reference_, loads=usual, floors=floors)
+        self.reference_ = replace(self.reference_, sizes=usual, floors=floors)
         if self.engine == "model":
             self._model = fit_model(list(healthy), layout, dead > 0, progress=progress)
             calibrator = Calibrator.cold()
@@ -775,11 +775,11 @@ class SelfDiagnosis:
         log = checked_recordings(recordings, self.layout)
         reference = self.reference_
         loads = self._loads(log)
-        if loads is None or reference is None or reference.loads is None:
+        if loads is None or reference is None or reference.sizes is None:
             return None
         scale = reference.scale
         present = living(self._planes, reference.dead).present.ravel()
-        gain = gain_of(loads_of(loads, scale.near, present), reference.loads)
+        gain = reference.sizes.gain(list(loads), scale.near, present)
         if gain == 1.0:
             return None
         usual = without_gain(loads, gain, scale.baseline)

@@ -244,13 +244,20 @@ def _found_again(diagnoser: SelfDiagnosis, frames: Frames, rewiring: Rewiring) -
 
 def _put_back(diagnoser: SelfDiagnosis, frames: Frames) -> ChangedReadings | None:
     """Return a log with exchanged wires put back, in the recordings in which they are; None where
-    none are."""
+    none are, or only with a gain of the whole array: a pad that reads more is like another pad."""
+    usual = diagnoser.without_gain(frames)
     in_part = diagnoser.swapped_in_part(frames)
+    if in_part is not None and usual is not None:
+        again = diagnoser.swapped_in_part(usual)
+        if again is None or not np.array_equal(again.source, in_part.source):
+            in_part = None
     if in_part is not None:
         put_back = in_part.undo(frames)
         return ChangedReadings(None, None, put_back, diagnoser.diagnose(put_back), in_part=in_part)
     rewiring = diagnoser.rewiring(frames)
     if rewiring is None:
+        return None
+    if usual is not None and not _found_again(diagnoser, list(usual), rewiring):
         return None
     put_back = [rewiring.undo(recording) for recording in frames]
     return ChangedReadings(rewiring, None, put_back, diagnoser.diagnose(put_back))

@@ -261,6 +261,10 @@ def _judged(
     disturbances are known.
     """
     common = find_common_mode(log, healthy, diagnoser.layout) if healthy else None
+    if common is not None:  # where all cells read more, so does what they share
+        usual = diagnoser.without_gain(log)
+        if usual is not None and find_common_mode(list(usual), healthy, diagnoser.layout) is None:
+            common = None
     as_it_is = find_changed_readings(
         diagnoser,
         log,
@@ -269,9 +273,6 @@ def _judged(
         comparable=not disturbed,
     )
     if common is None:
-        return as_it_is, None
-    # Where all cells read more, so does what they share of a contact.
-    if not as_it_is.diagnosis.faults and diagnoser.without_gain(log) is not None:
         return as_it_is, None
     undone = common.undo(log, diagnoser.layout)
     without = find_changed_readings(

@@ -26,6 +26,7 @@ from diagnostics.preprocessing.offset import ReferenceOffset, highest_rests, lev
 from diagnostics.preprocessing.readings import SEGMENT, RecordingBlocks, spread
 from diagnostics.preprocessing.scale import Scale
 from diagnostics.preprocessing.transport import Patience
+from diagnostics.sensor.gain import UsualSizes
 
 if TYPE_CHECKING:
     from diagnostics.layout import SensorLayout
@@ -54,8 +55,7 @@ class Reference:
         beside: lower limit of the readings of healthy cells, relative to their pad; None: unknown.
         life: how cells depend on each other; None: unknown.
         noise: what all cells have; None: unknown.
-        loads: float ``[n]``, load of each recording (:mod:`diagnostics.sensor.gain`); None:
-            unknown.
+        sizes: how far cells move (:mod:`diagnostics.sensor.gain`); None: unknown.
         floors: float ``[2, pads]``, share of the highest reading of its row or column that hardly
             any cell reads less of (:mod:`diagnostics.sensor.crosstalk`); None: unknown.
         rests: float ``[pads]``, how far above their baselines the cells of each pad rest together,
@@ -77,7 +77,7 @@ class Reference:
     beside: PadLimit | None = None
     life: LifeModel | None = None
     noise: UsualNoise | None = None
-    loads: NDArray[np.float64] | None = None
+    sizes: UsualSizes | None = None
     floors: NDArray[np.float64] | None = None
     rests: NDArray[np.float64] | None = None
 

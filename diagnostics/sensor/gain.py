@@ -1,11 +1,11 @@
 """Gain of the whole array: all its cells read more, or less, than in the reference, as with another
 cover, another supply or heavier objects.
 
-The load of a recording is the upper quartile, over the cells that move in it, of highest less low
-reading, both above the median of all cells in the frame. The gain is the ratio of the median loads
-of log and reference; it is 1 where the test of Kolmogorov and Smirnov finds no difference
-(p < 1e-4), and between 1 / 1.3 and 1.3. Cells are judged after it is taken out, where that explains
-more of them.
+The size of a cell in a recording is its highest less its low reading, both above the median of all
+cells in the frame. The gain is the median ratio of quantiles of the sizes of log and reference, of
+all cells in recordings with contact, at the ranks at which those of the reference are loaded; it is
+1 between 1 / 1.3 and 1.3. Other objects have the same effect: cells are judged, and wires compared,
+after it is taken out where that explains more of them.
 
 Not detected: fewer than five recordings with contact, and a gain that comes and goes.
 """
@@ -13,28 +13,69 @@ Not detected: fewer than five recordings with contact, and a gain that comes and
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from diagnostics.evidence.drift import GAIN
-from diagnostics.preprocessing.levels import LEAST_LOADED, LOW, MAJORITY
+from diagnostics.preprocessing.levels import LOW, MAJORITY
 from diagnostics.preprocessing.quantiles import known_quantile
-from diagnostics.sensor.sensor_change import differ
+
+_FEWEST = 5  # recordings, of the log and of the reference
+# shares of the loaded sizes that are larger: less loaded ones are noise, the largest saturate
+_LOADED = np.linspace(0.02, 0.5, 25)
 
 Floats = NDArray[np.float64]
 
 
-def loads_of(recordings: Sequence[NDArray[Any]], near: float, present: NDArray[np.bool_]) -> Floats:
-    """Return the load of each recording in which a cell moves, ``[n]``.
+@dataclass(frozen=True)
+class UsualSizes:
+    """How far the cells of a reference move.
 
-    Args:
-        recordings: loads ``[T, D]`` each; NaN = missing.
-        near: changes up to this count as none.
-        present: bool ``[D]``, where there is a cell.
+    Attributes:
+        ranks: float ``[n]``, of the loaded sizes.
+        sizes: float ``[n]``, the quantiles.
     """
-    loads = []
+
+    ranks: Floats
+    sizes: Floats
+
+    @classmethod
+    def of(
+        cls, recordings: Sequence[NDArray[Any]], near: float, present: NDArray[np.bool_]
+    ) -> UsualSizes | None:
+        """Return those of healthy loads ``[T, D]``; None where hardly a cell is loaded.
+
+        Args:
+            recordings: ``[T, D]`` each; NaN = missing.
+            near: changes up to this count as none.
+            present: bool ``[D]``, where there is a cell.
+        """
+        sizes = _sizes_of(recordings, near, present)
+        if sizes is None:
+            return None
+        ranks = 1 - _LOADED * float((sizes > 2 * near).mean())
+        return cls(ranks, np.quantile(sizes, ranks))
+
+    def gain(
+        self, recordings: Sequence[NDArray[Any]], near: float, present: NDArray[np.bool_]
+    ) -> float:
+        """Return the gain of a log, as for :meth:`of`; 1 where it hardly differs, or is unknown."""
+        sizes = _sizes_of(recordings, near, present)
+        if sizes is None:
+            return 1.0
+        gain = float(np.median(np.quantile(sizes, self.ranks) / self.sizes))
+        return gain if gain > 0 and max(gain, 1 / gain) >= GAIN else 1.0
+
+
+def _sizes_of(
+    recordings: Sequence[NDArray[Any]], near: float, present: NDArray[np.bool_]
+) -> Floats | None:
+    """Return the sizes of all cells in the recordings in which one is loaded, ``[n]``; None: too
+    few of these."""
+    sizes = []
     for given in recordings:
         frames = np.asarray(given, dtype=np.float64)[:, present]
         if not len(frames):
@@ -42,19 +83,10 @@ def loads_of(recordings: Sequence[NDArray[Any]], near: float, present: NDArray[n
         # A hum or a ramp of all cells is no load.
         frames = frames - known_quantile(frames, MAJORITY, axis=1)[:, None]
         size = np.fmax.reduce(frames) - known_quantile(frames, LOW, axis=0)
-        moving = size[size > 2 * near]
-        if len(moving):
-            loads.append(float(np.quantile(moving, 1 - LEAST_LOADED)))
-    return np.array(loads, dtype=np.float64)
-
-
-def gain_of(new: Floats, usual: Floats) -> float:
-    """Return the ratio of the loads of recordings and the usual ones, ``[n]`` each; 1 where they do
-    not differ."""
-    if not differ(new, usual):
-        return 1.0
-    gain = float(np.median(new) / np.median(usual))
-    return gain if max(gain, 1 / gain) >= GAIN else 1.0
+        size = size[np.isfinite(size)]
+        if len(size) and size.max() > 2 * near:
+            sizes.append(size)
+    return np.concatenate(sizes) if len(sizes) >= _FEWEST else None
 
 
 def without_gain(recordings: Sequence[NDArray[Any]], gain: float, rest: Floats) -> list[Floats]:

@@ -4,9 +4,12 @@ blamed for it."""
 import numpy as np
 import pytest
 from conftest import without_calibration
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 import adaptfault as af
 from diagnostics import Fault, SelfDiagnosis, SensorLayout, inject
+from diagnostics.sensor.gain import UsualSizes
 
 LAYOUT = SensorLayout(1, 4, 4, full_scale=1023.0, unit="count", rate=50.0)
 PLACES = np.argwhere(np.ones((4, 4)))
@@ -52,6 +55,18 @@ def test_an_array_with_another_gain_is_told_and_diagnosis_and_inspection_blame_n
     assert "gain" in {finding.name for finding in found.findings}
     assert not found.diagnosis.fault_set
     assert not fitted.diagnose(log).fault_set
+
+
+@settings(max_examples=20)
+@given(gain=st.floats(0.3, 3), seed=st.integers(0, 99))
+def test_a_gain_is_measured_where_a_few_counts_are_a_load(gain, seed):
+    def counts(recordings: list[np.ndarray]) -> list[np.ndarray]:
+        return [np.rint(np.minimum(frames / 12, 60)) for frames in recordings]
+
+    usual = UsualSizes.of(counts(grasps(1, 60)), 1.0, np.ones(16, bool))
+    assert usual is not None
+    measured = usual.gain(counts(grasps(100 + seed, 40, gain)), 1.0, np.ones(16, bool))
+    assert 1 / 1.5 < measured / gain < 1.5
 
 
 def test_a_gain_with_which_the_amplifier_saturates_is_told_with_both(fitted, reference):

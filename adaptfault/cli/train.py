@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import shutil
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from adaptfault.adaptation.adapter import Adapter
+    from adaptfault.adaptation.result import Adaptation
     from adaptfault.data.recordings import Recordings
     from adaptfault.data.windows import Windows
     from adaptfault.evaluation.scores import Scores, ValueScores
@@ -72,61 +73,54 @@ class Train(Reading):
     sign: Read | None = sign_option("X.bundle")
     device: str = device_option()
 
+    @property
+    def path(self) -> Path:
+        """Of the model or the bundle."""
+        return Path(self.out)
+
+    @property
+    def bundled(self) -> bool:
+        """Whether a bundle is made."""
+        return self.path.suffix == ".bundle"
+
+    @property
+    def folder(self) -> Path:
+        """Folder of the checkpoint while the training runs."""
+        return self.path.with_name(f".{self.path.name}.training") if self.bundled else self.path
+
     def run(self) -> int:
         """Train, evaluate on the test recordings, save."""
-        out = Path(self.out)
-        bundled = out.suffix == ".bundle"
-        if bundled and _was_done(self, out):
+        if self.bundled and _was_done(self):
             return 0
-        _check_options(self, out, bundled)
+        _check_options(self)
         recordings = self.load(self.recordings, labelled=True)
         where = chosen_device(self.device)
         if _shows_faults(recordings) and self.strict:
             return 1
+        _check_classes(self.recordings[0], recordings)
 
         from adaptfault.adaptation.adapter import Adapter
         from adaptfault.cli.trained_model import say_short
         from adaptfault.data.windows import make_windows, split
-        from adaptfault.evaluation.scores import Scores, ValueScores
-        from adaptfault.models.network import TactileTransformer
-        from adaptfault.models.store import save_model
         from diagnostics import FaultSet
 
+        layout = recordings.layout
         values = recordings.targets is not None
         names = recordings.value_names if values else recordings.class_names
-        _check_classes(self.recordings[0], recordings)
-        windows = make_windows(
-            recordings.frames,
-            recordings.targets if values else recordings.labels,
-            recordings.layout,
-            length=self.length,
-        )
+        targets = recordings.targets if values else recordings.labels
+        windows = make_windows(recordings.frames, targets, layout, length=self.length)
         parts = split(windows, seed=self.seed)
-        self.say(f"{recordings.layout}; {windows}")
+        self.say(f"{layout}; {windows}")
         say_short(self, recordings, self.length)
-        n_classes = len(names)
         units = _units(self, names, parts[0]) if values else None
-        model: TactileTransformer | AnyModel
-        if self.builder:
-            model = _built(self.builder, windows, recordings.layout, n_classes, values)
-        else:
-            model = TactileTransformer(
-                recordings.layout, n_classes, length=self.length, seed=self.seed
-            )
-        folder = _training_folder(out) if bundled else out
-        history = _trained(self, model.to(where), parts, folder, units)
+        model = _model(self, windows, layout, len(names), values)
+        history = _trained(self, model.to(where), parts, units)
         adapter = Adapter(model.cpu(), parts[0], parts[1])
-        healthy = (
-            adapter.healthy
-            if self.head == "auto"
-            else adapter.adapt(FaultSet((), model.layout.n_cells), method="fill")
-        )
+        healthy = adapter.healthy
+        if self.head == "linear":
+            healthy = adapter.adapt(FaultSet((), layout.n_cells), method="fill")
         predicted = healthy.predict(parts[2].x)
-        scores: Scores | ValueScores
-        if units is None:
-            scores = Scores.of(parts[2].y, predicted, n_classes=n_classes)
-        else:
-            scores = ValueScores.of(parts[2].y, predicted)
+        scores = _scores(parts[2], predicted, len(names), values)
         extra = {
             "split_seed": self.seed,
             "test_scores": scores.to_dict(),
@@ -134,29 +128,57 @@ class Train(Reading):
         }
         if units is not None:
             extra["units"] = units.to_dict(names)
-        if bundled:
-            _bundle(self, out, recordings, adapter, parts, names)
-            shutil.rmtree(folder)
+        if self.bundled:
+            _bundle(self, recordings, adapter, parts, names)
         else:
-            save_model(
-                out,
-                model,
-                class_names=names,
-                extra=extra,
-                head=healthy.model.head,
-                task=adapter.task,
-            )
-            (folder / _CHECKPOINT).unlink()  # the run is complete: nothing is left to resume
-        if isinstance(scores, Scores) and recordings.labels is not None:
-            from adaptfault.evaluation.training_check import rest_level_note
-
-            if note := rest_level_note(recordings.frames, recordings.labels, scores.accuracy):
-                self.say(note)
-        problems = _told(self, out, bundled, scores, history, names, extra, (parts[2].y, predicted))
+            _save(self, adapter, healthy, names, extra)
+        _note_rest_levels(self, recordings, scores)
+        problems = _told(self, scores, history, names, extra, (parts[2].y, predicted))
         return int(self.strict and bool(problems))
 
 
 add = Train.add
+
+
+def _scores(
+    test: Windows, predicted: NDArray[Any], n_classes: int, values: bool
+) -> Scores | ValueScores:
+    from adaptfault.evaluation.scores import Scores, ValueScores
+
+    if values:
+        return ValueScores.of(test.y, predicted)
+    return Scores.of(test.y, predicted, n_classes=n_classes)
+
+
+def _note_rest_levels(args: Train, recordings: Recordings, scores: Scores | ValueScores) -> None:
+    """Say where classes differ in what untouched cells read."""
+    from adaptfault.evaluation.scores import Scores
+    from adaptfault.evaluation.training_check import rest_level_note
+
+    if isinstance(scores, Scores) and recordings.labels is not None:
+        note = rest_level_note(recordings.frames, recordings.labels, scores.accuracy)
+        if note:
+            args.say(note)
+
+
+def _save(
+    args: Train,
+    adapter: Adapter,
+    healthy: Adaptation,
+    names: Sequence[str],
+    extra: Mapping[str, Any],
+) -> None:
+    from adaptfault.models.store import save_model
+
+    save_model(
+        args.path,
+        adapter.model,
+        class_names=names,
+        extra=extra,
+        head=healthy.model.head,
+        task=adapter.task,
+    )
+    (args.folder / _CHECKPOINT).unlink()  # the run is complete: nothing is left to resume
 
 
 def _shows_faults(recordings: Recordings) -> bool:
@@ -185,37 +207,32 @@ def _check_classes(path: str, recordings: Recordings) -> None:
         )
 
 
-def _training_folder(out: Path) -> Path:
-    """Return the folder of the checkpoint while a bundle is made."""
-    return out.with_name(f".{out.name}.training")
-
-
-def _was_done(args: Train, out: Path) -> bool:
+def _was_done(args: Train) -> bool:
     """Return whether a run of this command was cut off after its bundle was whole, and end it.
 
     Raises:
         Untrusted: the bundle is to be signed, and is not.
     """
-    folder = _training_folder(out)
-    if not (folder.is_dir() and is_bundle(out)):
+    out = args.path
+    if not (args.folder.is_dir() and is_bundle(out)):
         return False
     from adaptfault.bundle.bundle import Bundle
 
     Bundle.open(out, keys=None if args.sign is None else [args.sign])
-    shutil.rmtree(folder)
+    shutil.rmtree(args.folder)
     result = {"schema": "adaptfault.train/1", "bundle": str(out)}
     args.emit(result, f"bundle: {out}, whole; the run that made it was cut off at its end")
     return True
 
 
-def _check_options(args: Train, out: Path, bundled: bool) -> None:
+def _check_options(args: Train) -> None:
     """Refuse what would fail after the training."""
-    if bundled and out.exists():
-        raise ValueError(f"{out} exists: choose another name, or remove it")
+    if args.bundled and args.path.exists():
+        raise ValueError(f"{args.path} exists: choose another name, or remove it")
     if args.sign is not None:
         from adaptfault.bundle.signature import read_private_key
 
-        if not bundled:
+        if not args.bundled:
             raise ValueError("--sign signs bundles: give --out X.bundle")
         read_private_key(args.sign)
 
@@ -224,7 +241,6 @@ def _trained(
     args: Train,
     model: TactileTransformer | AnyModel,
     parts: tuple[Windows, Windows, Windows],
-    folder: Path,
     units: ValueUnits | None,
 ) -> History:
     """Train in place; the checkpoint in the folder continues a training that was cut off.
@@ -233,8 +249,8 @@ def _trained(
     """
     from adaptfault.models.training import train
 
-    folder.mkdir(parents=True, exist_ok=True)
-    checkpoint = folder / _CHECKPOINT
+    args.folder.mkdir(parents=True, exist_ok=True)
+    checkpoint = args.folder / _CHECKPOINT
     if checkpoint.exists():
         args.say(f"continuing from {checkpoint}")
     training, validation = parts[:2]
@@ -303,8 +319,6 @@ def _units(args: Train, names: Sequence[str], training: Windows) -> ValueUnits:
 
 def _told(
     args: Train,
-    out: Path,
-    bundled: bool,
     scores: Scores | ValueScores,
     history: History,
     names: Sequence[str],
@@ -321,8 +335,12 @@ def _told(
         value_training_problems,
     )
 
-    kind = "bundle" if bundled else "model"
-    picture = out.with_name(f"{out.stem}.training.png") if bundled else out / "training.png"
+    out = args.path
+    kind = "model"
+    picture = out / "training.png"
+    if args.bundled:
+        kind = "bundle"
+        picture = out.with_name(f"{out.stem}.training.png")
     if isinstance(scores, ValueScores):
         figure = plot_value_training(*values, scores, history, names)
         problems = value_training_problems(scores, history)
@@ -347,34 +365,38 @@ def _told(
     return problems
 
 
-def _built(
-    builder: str, windows: Windows, layout: SensorLayout, n_classes: int, values: bool
+def _model(
+    args: Train, windows: Windows, layout: SensorLayout, n_classes: int, values: bool
 ) -> TactileTransformer | AnyModel:
-    """Build the user's model; naming the builder on the command line allows it."""
+    """Return the paper's network, or the user's: naming its builder on the command line allows
+    it."""
+    if args.builder is None:
+        from adaptfault.models.network import TactileTransformer
+
+        return TactileTransformer(layout, n_classes, length=args.length, seed=args.seed)
     from adaptfault.models.any_model import AnyModel
     from adaptfault.models.builders import allow_model, build_model
     from adaptfault.models.network import as_tensor
     from adaptfault.models.value_units import foldable
 
-    allow_model(builder)
-    model = build_model(builder, layout, n_classes, length=windows.x.shape[1])
+    allow_model(args.builder)
+    model = build_model(args.builder, layout, n_classes, length=args.length)
     wrapped = AnyModel.probe(model, layout, as_tensor(windows.x[:8]))
     if wrapped.n_classes != n_classes:
         raise ValueError(
-            f"--model {builder} has {wrapped.n_classes} outputs, the recordings have {n_classes}"
-            f" {'values' if values else 'classes'}"
+            f"--model {args.builder} has {wrapped.n_classes} outputs, the recordings have"
+            f" {n_classes} {'values' if values else 'classes'}"
         )
     if values and not foldable(wrapped):
         raise ValueError(
-            f"--model {builder} does not end with a nn.Linear with a bias, which takes up the units"
-            " of the values: end the module with one"
+            f"--model {args.builder} does not end with a nn.Linear with a bias, which takes up the"
+            " units of the values: end the module with one"
         )
     return wrapped
 
 
 def _bundle(
     args: Train,
-    out: Path,
     recordings: Recordings,
     adapter: Adapter,
     parts: tuple[Windows, Windows, Windows],
@@ -388,7 +410,7 @@ def _bundle(
 
     training, _, test = parts
     Bundle.create(
-        out,
+        args.path,
         adapter.model,
         adapter,
         fit_diagnoser(args, recordings.select(np.unique(training.recording)), told=False),
@@ -398,3 +420,4 @@ def _bundle(
         head=args.head,
         sign=args.sign,
     )
+    shutil.rmtree(args.folder)

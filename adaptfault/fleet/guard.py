@@ -1,4 +1,9 @@
-"""A worker process for one robot at a time: a crash or a timeout affects that robot only."""
+"""A worker process for one robot at a time: a crash or a timeout affects that robot only.
+
+loky, where there is pebble: that one imports the main script anew in each process, so that a script
+without a guard of ``__main__`` has no workers, takes no functions that are made on the spot, and
+replaces no process that grows.
+"""
 
 from __future__ import annotations
 

@@ -1,5 +1,9 @@
 """Metrics of robots as a text file that Prometheus reads, through node_exporter's textfile
-collector."""
+collector.
+
+By hand, where there is prometheus_client: its registry and collector are as long as the function
+that writes the text, whose format its parser checks in the tests.
+"""
 
 from __future__ import annotations
 

@@ -9,6 +9,9 @@
 
 Foxglove draws the rows of a grid upwards, so the last row of a pad comes first. The states lie
 below the readings, the restored ones below the states.
+
+With mcap, where there is foxglove-sdk: that one writes protobuf, and the recordings of such a file
+are read back as JSON; its channels of JSON need the same schemas.
 """
 
 from __future__ import annotations

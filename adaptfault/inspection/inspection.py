@@ -39,6 +39,7 @@ OF_FRAMES: Mapping[str, Name] = {
     "one_signal": "one_signal",
     "corrupt_frame": "corrupt_frame",
     "common_spike": "common_spike",
+    "repeated_frames": "repeated_frames",
     "crosstalk": "crosstalk",
 }
 """Names of the findings of each kind of transport fault."""

@@ -14,7 +14,7 @@ from adaptfault.inspection.inspection import OF_CELLS, Finding, Inspection, insp
 from diagnostics import Diagnosis, SelfDiagnosis
 from diagnostics.threads import one_thread
 
-_OF_PARTS = ("one_signal", "corrupt_frame", "common_spike", "crosstalk")
+_OF_PARTS = ("one_signal", "corrupt_frame", "common_spike", "repeated_frames", "crosstalk")
 """Names of the findings that the diagnosis of the whole log no longer sees."""
 
 

@@ -37,6 +37,7 @@ Name = Literal[
     "one_signal",
     "corrupt_frame",
     "common_spike",
+    "repeated_frames",
     "swapped_in_part",
     "another_sensor",
     "coincides",
@@ -63,6 +64,7 @@ _OF_FINDING: Mapping[Name, int] = {
     "normalised": 2,
     "silent_array": 2,
     "lost_frames": 0,
+    "repeated_frames": 0,
 }
 
 

@@ -31,7 +31,7 @@ class TransportFault:
     Attributes:
         kind: ``"lost"`` (frames without any reading), ``"frozen"`` (one frame repeated),
             ``"invalid"`` (readings that no converter gives), ``"corrupt_frame"``,
-            ``"common_spike"``, ``"one_signal"`` or ``"crosstalk"``
+            ``"common_spike"``, ``"one_signal"``, ``"repeated_frames"`` or ``"crosstalk"``
             (:mod:`diagnostics.sensor.shared`).
         onset: number of the first such frame.
         frames: how many frames; of ``"invalid"``: how many readings.

@@ -22,6 +22,7 @@ from diagnostics.preprocessing.transport import TransportFault
 from diagnostics.sensor.crosstalk import Crosstalk
 from diagnostics.sensor.odd_frames import OddFrame, evenly, find_odd_frames, without_odd_frames
 from diagnostics.sensor.one_signal import OneSignal, find_one_signal
+from diagnostics.sensor.repeated_frames import find_repeated_frames
 
 if TYPE_CHECKING:
     from diagnostics.preprocessing.readings import RecordingBlocks
@@ -62,6 +63,11 @@ class Shared:
         recordings = without_odd_frames(recordings, odd, layout)
         begins = np.cumsum([0, *map(len, recordings)])
         faults = _told(odd, begins, layout)
+        repeated = find_repeated_frames(recordings, layout)
+        if repeated is not None:
+            n_repeated = round(repeated.share * int(begins[-1]))
+            text = repeated.reason(layout.rate)
+            faults.append(TransportFault("repeated_frames", 0, n_repeated, text))
         faults += [TransportFault("one_signal", 0, int(begins[-1]), one.reason) for one in groups]
         return cls(recordings, layout, tuple(faults), groups)
 

@@ -4,7 +4,6 @@ line."""
 from __future__ import annotations
 
 import logging
-import sys
 import traceback
 from collections.abc import Sequence
 from pkgutil import extend_path
@@ -13,7 +12,7 @@ from adaptfault import __version__
 from adaptfault.cli.command import Command, Foreign
 from adaptfault.cli.parser import BAD_INPUT, Parser
 from adaptfault.cli.paths import check_paths
-from adaptfault.cli.streams import LogAboveBars, finish, is_unread, one_line, prepare, settle
+from adaptfault.cli.streams import LogAboveBars, is_unread, one_line, prepare, settle
 from adaptfault.data.plugins import plugins, what_to_install
 from adaptfault.data.shortage import is_shortage
 
@@ -68,19 +67,7 @@ def _parser() -> Parser:
     return parser
 
 
-def _with_left_out(command: Command, code: int) -> int:
-    """Return the exit code of a command; where files were left out, it is 1 at least, and the last
-    line says so."""
-    if not command.left_out:
-        return code
-    were = f"{command.left_out} files or recordings were"
-    if command.left_out == 1:
-        were = "1 file or recording was"
-    print(f"adaptfault {command.command}: {were} left out; see the errors above", file=sys.stderr)
-    return max(code, 1)
-
-
-def _failed(name: str, error: Exception) -> int:
+def _failed(command: Command, error: Exception) -> int:
     """Tell an error in one line; return the exit code.
 
     Python's own code for a traceback, 1, would read as "degraded but handled".
@@ -92,11 +79,11 @@ def _failed(name: str, error: Exception) -> int:
         what = "what it reads nests too deep; check the files that were given"
     elif isinstance(error, ValueError | OSError) or is_shortage(error):
         what = one_line(error)
-    if what is not None:
-        print(f"adaptfault {name}: error: {what}", file=sys.stderr)
-        return BAD_INPUT
-    traceback.print_exception(error)
-    print(f"adaptfault {name}: internal error; please report the lines above", file=sys.stderr)
+    if what is None:
+        traceback.print_exception(error)
+        command.complain("internal error; please report the lines above")
+    else:
+        command.complain(f"error: {what}")
     return BAD_INPUT
 
 
@@ -119,16 +106,15 @@ def _run(argv: Sequence[str] | None) -> int:
     log = logging.getLogger("adaptfault")
     handler = LogAboveBars()
     log.addHandler(handler)
-    command = args.make(args)
+    command: Command = args.make(args)
     try:
         check_paths(command)
-        code = command.run()
-        return finish(command, _with_left_out(command, code))
+        return command.finish(command.run())
     except KeyboardInterrupt:
         further = "; run the same command to continue" if command.continues else ""
-        print(f"adaptfault {args.command}: interrupted{further}", file=sys.stderr)
+        command.complain(f"interrupted{further}")
         return 130
     except Exception as error:
-        return _failed(args.command, error)
+        return _failed(command, error)
     finally:
         log.removeHandler(handler)

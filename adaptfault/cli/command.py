@@ -9,8 +9,10 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import Field, dataclass, field, fields
+from functools import partial
 from types import UnionType
 from typing import (
     TYPE_CHECKING,
@@ -23,8 +25,8 @@ from typing import (
     get_type_hints,
 )
 
-from adaptfault.cli.parser import Parser
-from adaptfault.cli.streams import above_bars, tell
+from adaptfault.cli.parser import BAD_INPUT, Parser
+from adaptfault.cli.streams import above_bars, failure_of
 from adaptfault.data.printable import printable
 
 if TYPE_CHECKING:
@@ -164,7 +166,35 @@ class Command:
     def emit(self, result: dict[str, Any], text: str) -> None:
         """Print the result on stdout."""
         shown = json.dumps(result, indent=1, allow_nan=False) if self.json else printable(text)
-        tell(self, shown)
+        self._write(partial(print, shown, flush=True))
+
+    def complain(self, text: str) -> None:
+        """Print a line on stderr that names the command."""
+        print(f"adaptfault {self.command}: {text}", file=sys.stderr)
+
+    def finish(self, code: int) -> int:
+        """Return the exit code of a command that ran; the last line says what is not as it should.
+
+        A command that decides something for a robot has done so, where its result cannot be
+        printed: its code still says what, as a warning.
+        """
+        if self.left_out:
+            were = f"{self.left_out} files or recordings were"
+            if self.left_out == 1:
+                were = "1 file or recording was"
+            self.complain(f"{were} left out; see the errors above")
+            code = max(code, 1)
+        with suppress(ValueError):  # closed
+            self._write(sys.stdout.flush)
+        if not self.untold:
+            return code
+        return max(code, 1 if self.decides else BAD_INPUT)
+
+    def _write(self, write: Callable[[], None]) -> None:
+        error = failure_of(write)
+        if error is not None:
+            self.untold = True
+            self.complain(f"error: the result could not be printed: {error.strerror}")
 
     def tell_problems(self, problems: Sequence[Problem]) -> None:
         """Print problems; recordings that are left out make the exit code 1 at least."""

@@ -91,7 +91,7 @@ def _maintain(args: Maintain) -> int:
         try:
             write(args, bundle, report)
         except Exception as error:  # the run is done, and its code says what was decided
-            print(f"adaptfault maintain: error: {one_line(error)}", file=sys.stderr)
+            args.complain(f"error: {one_line(error)}")
             code = max(code, 1)
     return code
 

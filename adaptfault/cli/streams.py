@@ -12,13 +12,10 @@ import os
 import sys
 from collections.abc import Callable
 from contextlib import suppress
-from typing import TYPE_CHECKING, Any, TextIO
+from typing import Any, TextIO
 
 from adaptfault.data.printable import printable
 from adaptfault.data.shortage import is_shortage
-
-if TYPE_CHECKING:
-    from adaptfault.cli.command import Command
 
 _STREAMS = ("stdin", "stdout", "stderr")
 _LONGEST = 2000  # characters of an error
@@ -93,24 +90,6 @@ class LogAboveBars(logging.Handler):
         above_bars(self.format(record))
 
 
-def tell(command: Command, text: str) -> None:
-    """Print on stdout; nobody may read it any more."""
-    _attempt(command, lambda: print(text, flush=True))
-
-
-def finish(command: Command, code: int) -> int:
-    """Return the exit code of a command whose result was printed, or could not be.
-
-    A command that decides something for a robot has done so: its code still says what, as a
-    warning.
-    """
-    with suppress(ValueError):  # closed
-        _attempt(command, sys.stdout.flush)
-    if not command.untold:
-        return code
-    return max(code, 1 if command.decides else 3)
-
-
 def settle() -> None:
     """Empty stdout at the end, so that the interpreter finds nothing that cannot be written."""
     try:
@@ -135,17 +114,15 @@ def is_unread(error: BaseException) -> bool:
     return False
 
 
-def _attempt(command: Command, write: Callable[[], None]) -> None:
-    """Write on stdout; what is still printed after an error vanishes."""
+def failure_of(write: Callable[[], None]) -> OSError | None:
+    """Write on stdout; returns why it failed. That nobody reads it any more is no failure, and what
+    is printed later vanishes."""
     try:
         write()
-    except BrokenPipeError:
-        _discard(sys.stdout)
     except OSError as error:
-        command.untold = True
         _discard(sys.stdout)
-        what = f"the result could not be printed: {error.strerror}"
-        print(f"adaptfault {command.command}: error: {what}", file=sys.stderr)
+        return None if isinstance(error, BrokenPipeError) else error
+    return None
 
 
 def _discard(stream: TextIO) -> None:

@@ -60,10 +60,12 @@ class Task:
         return x, np.concatenate([self.train.y, self.validation.y])
 
 
-def by_recording(recordings: af.Recordings, split: int, length: int = 10) -> Task:
+def by_recording(
+    recordings: af.Recordings, split: int, length: int = 10, stride: int | None = None
+) -> Task:
     """Split by recording, at random."""
     windows = af.make_windows(
-        recordings.frames, recordings.labels, recordings.layout, length=length
+        recordings.frames, recordings.labels, recordings.layout, length=length, stride=stride
     )
     return Task(recordings.layout, *af.split(windows, seed=split))
 
@@ -84,7 +86,9 @@ def soles(split: int) -> Task:
     return by_recording(stored(SOLES), split)
 
 
-def fabric(split: int, change: Callable[[np.ndarray], np.ndarray] = lambda x: x) -> Task:
+def fabric(
+    split: int, change: Callable[[np.ndarray], np.ndarray] = lambda x: x, most: int = MOST
+) -> Task:
     """One repetition of each slide to learn from, the other one as test; ``split`` chooses which,
     and what is validated on."""
     with np.load(DATA / FABRIC) as kept:
@@ -96,7 +100,7 @@ def fabric(split: int, change: Callable[[np.ndarray], np.ndarray] = lambda x: x)
     first = split % 2
     learnt = windows.select(np.flatnonzero(trial[windows.recording] == first))
     test = windows.select(np.flatnonzero(trial[windows.recording] != first))
-    learnt = learnt.select(evenly(len(learnt), MOST))
+    learnt = learnt.select(evenly(len(learnt), most))
     train, validation, _ = af.split(learnt, test=0.0, validation=0.25, seed=split)
     return Task(layout, train, validation, test.select(evenly(len(test), MOST)))
 

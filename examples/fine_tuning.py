@@ -43,8 +43,8 @@ from torch.nn.utils import parametrize
 import adaptfault as af
 from adaptfault.adaptation.reduced_model import ReducedModel, reduce_windows
 from adaptfault.adaptation.stages import Run
-from adaptfault.models.heads import calibrate
 from adaptfault.models.network import logits_of
+from adaptfault.models.targets import calibrate
 from diagnostics import FaultSet
 
 FORMS = (

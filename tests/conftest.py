@@ -25,7 +25,7 @@ from diagnostics import Fault, FaultSet, Line, SelfDiagnosis, SensorLayout, inje
 from diagnostics.decision.calibration import Calibrator
 
 _TREES = forest.TREES
-_WITH_TREES = ("forest", "heads")
+_WITH_TREES = ("forest", "targets")
 
 # The same few examples on every machine.
 hypothesis.settings.register_profile(
@@ -205,6 +205,7 @@ def export_versions(home: Path) -> None:
     from adaptfault.data.windows import Windows
     from adaptfault.imputation.statistics import CellStatistics
     from adaptfault.models.heads import Head
+    from adaptfault.models.kernels import Kernels, Known
     from adaptfault.models.network import TactileTransformer
     from adaptfault.prediction.export import add_onnx
 
@@ -221,35 +222,19 @@ def export_versions(home: Path) -> None:
                     torch.from_numpy(phi(windows.x, fault_set))
                 )
             weights = torch.from_numpy(
-                np.random.default_rng(1).normal(0, 3, (4, 60, 3)).astype("f4")
+                np.random.default_rng(1).normal(0, 3, (2, 60, 3)).astype("f4")
             )
             weights -= weights.mean(1, keepdim=True)  # no class is preferred everywhere
-            known = [*views[:4], views[3]]
-            apart = [torch.cdist(view, view) for view in known]
-            amounts = [torch.cdist(view, view, p=1) for view in known]
-            widths = [
-                apart[0],
-                apart[1],
-                apart[2],
-                amounts[0],
-                amounts[1],
-                apart[3],
-                amounts[3],
-                apart[4],
-                amounts[4],
-            ]
-            for i in (0, 1, 2, 5, 7):
-                widths[i] = widths[i].square()
+            known = Known(*views[:3])
             head = Head(
                 known,
-                widths=torch.stack([width.median() for width in widths]),
+                widths=Kernels(known).widths,
                 weights=weights,
                 bias=torch.zeros(3),
-                shares=torch.tensor([0.1, 0.4, 0.2, 0.3]),
-                forest=small_forest(views[4]),
+                shares=torch.tensor([0.4, 0.6]),
+                forest=small_forest(views.course),
                 pooling=torch.tensor([0.9, 0.3]),
-                units=torch.ones(known[-1].shape[1]),
-                restoring=torch.zeros_like(known[-1]),
+                units=torch.ones(known.moments.shape[1]),
                 rest=torch.linspace(0, 0.1, 18),
             )
         model = ReducedModel(network, fault_set, front, head).eval()
@@ -325,7 +310,7 @@ def without_export() -> Iterator[None]:
 
 @pytest.fixture(scope="session", autouse=True)
 def few_trees() -> Iterator[None]:
-    """Let a head have 40 trees in place of 200, which take most of its time; see ``all_trees``."""
+    """Let a head have fewer trees, which take most of its time; see ``all_trees``."""
     with pytest.MonkeyPatch.context() as patch:
         for module in _WITH_TREES:
             patch.setattr(f"adaptfault.models.{module}.TREES", 8)
@@ -334,7 +319,7 @@ def few_trees() -> Iterator[None]:
 
 @pytest.fixture
 def all_trees(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let a head have its 200 trees, where its accuracy is what is proven."""
+    """Let a head have all its trees, where its accuracy is what is proven."""
     for module in _WITH_TREES:
         monkeypatch.setattr(f"adaptfault.models.{module}.TREES", _TREES)
 

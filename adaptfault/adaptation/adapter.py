@@ -15,7 +15,7 @@ from adaptfault.adaptation.forecast import Forecast
 from adaptfault.adaptation.result import Adaptation
 from adaptfault.adaptation.stages import Method, Run
 from adaptfault.models.any_model import AnyModel, not_resettable
-from adaptfault.models.heads import log_likelihood
+from adaptfault.models.targets import log_likelihood
 from diagnostics import FaultSet
 from diagnostics.faults import Cells
 

@@ -1,5 +1,5 @@
-"""Summaries of the healthy cells of a window: each cell by itself, cells with their neighbours, and
-the course of each cell over time."""
+"""Summaries of the healthy cells of a window: cells with their neighbours, and the course of each
+cell over time."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ _REACH = 3  # cells on each side that smoothing with a Gaussian of standard devi
 class CellSummary(nn.Module):
     """Maps windows of the healthy cells to what does not depend on imputation.
 
-    The first two, for kernels, hold the roots of the mean and the maximum over time. The root
-    stabilises the variance: it raises the weight of light contact. A window that is shifted by a
-    cell is far from the original in the readings of the cells, but near to it after smoothing. The
-    third, for trees, is the course of each cell: mean, maximum, minimum, standard deviation and
-    mean step from frame to frame, which texture and noise raise.
+    The first, for kernels, holds the roots of the mean and the maximum over time of smoothed
+    readings. The root stabilises the variance: it raises the weight of light contact. A window that
+    is shifted by a cell is far from the original in the readings of the cells, but near to it after
+    smoothing. The second, for trees, is the course of each cell: mean, maximum, minimum, standard
+    deviation and mean step from frame to frame, which texture and noise raise.
 
     Args:
         layout: the array.
@@ -31,7 +31,8 @@ class CellSummary(nn.Module):
     seen: Tensor
     source: Tensor
     present: Tensor
-    weights: Tensor
+    along_rows: Tensor
+    along_columns: Tensor
 
     def __init__(self, layout: SensorLayout, fault_set: FaultSet) -> None:
         super().__init__()
@@ -42,33 +43,36 @@ class CellSummary(nn.Module):
         # those that lack.
         source = np.full(layout.n_cells, len(healthy))
         source[healthy] = np.where(present[healthy], np.arange(len(healthy)), len(healthy))
-        steps = torch.arange(-_REACH, _REACH + 1, dtype=torch.float32)
-        gauss = torch.exp(-steps.square() / 2)
         for name, values in (
             ("seen", torch.from_numpy(np.flatnonzero(present[healthy]))),
             ("source", torch.from_numpy(source)),
             ("present", torch.from_numpy(np.flatnonzero(present))),
-            ("weights", gauss / gauss.sum()),
+            ("along_rows", _gauss(self.cols)),
+            ("along_columns", _gauss(self.rows)),
         ):
             self.register_buffer(name, values, persistent=False)
 
-    def forward(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Map windows ``[N, T, D-k]`` to ``[N, 2 H]`` of the H healthy cells,
-        ``[N, 2 (P + pads)]``, and ``[N, 5 H]`` in double precision.
+    def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """Map windows ``[N, T, D-k]`` to ``[N, 2 (P + pads)]``, and to ``[N, 5 H]`` of the H
+        healthy cells in double precision.
 
-        The second summary has the readings of all P positions of the array, smoothed with a
+        The first summary has the readings of all P positions of the array, smoothed with a
         Gaussian of one cell (dead cells count as 0), and the sum of each pad.
         """
         n, t = x.shape[:2]
-        grid = F.pad(x, (0, 1))[..., self.source].reshape(
-            n * t * self.pads, 1, self.rows, self.cols
-        )
-        along_rows = F.conv2d(grid, self.weights.view(1, 1, 1, -1), padding=(0, _REACH))
-        smooth = F.conv2d(along_rows, self.weights.view(1, 1, -1, 1), padding=(_REACH, 0))
-        totals = grid.sum((2, 3)).reshape(n, t, self.pads)
-        smooth = smooth.reshape(n, t, self.pads * self.rows * self.cols)[..., self.present]
-        seen = x[..., self.seen]
-        return _over_time(seen), _over_time(torch.cat([smooth, totals], dim=2)), _course(seen)
+        grid = F.pad(x, (0, 1))[..., self.source].reshape(n, t, self.pads, self.rows, self.cols)
+        turned = (grid @ self.along_rows).mT.contiguous()
+        smooth = (turned @ self.along_columns).mT.flatten(2)[..., self.present]
+        totals = grid.sum((3, 4))
+        return _over_time(torch.cat([smooth, totals], dim=2)), _course(x[..., self.seen])
+
+
+def _gauss(n: int) -> Tensor:
+    """Return ``[n, n]``, the weights of n cells in a line in the smoothed value of each."""
+    apart = torch.arange(n, dtype=torch.float32)[:, None] - torch.arange(n)
+    weights = torch.exp(-apart.square() / 2) * (apart.abs() <= _REACH)
+    steps = torch.arange(-_REACH, _REACH + 1, dtype=torch.float32)
+    return weights / torch.exp(-steps.square() / 2).sum()
 
 
 def _over_time(x: Tensor) -> Tensor:

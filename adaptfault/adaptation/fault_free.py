@@ -94,14 +94,15 @@ class FaultFreeModel:
 
     @cached_property
     def compact(self) -> CompactNetwork | None:
-        """Low-rank form of the paper's network; None for other models, few windows or large
-        arrays."""
+        """Low-rank form of the paper's network for its windows; None for other models, few windows
+        or large arrays."""
         return self.compacted(self.model)
 
     def compacted(self, network: Network) -> CompactNetwork | None:
         """Return the low-rank form of a network on its device, where it saves time."""
-        windows = len(self.train) + len(self.validation)
-        return compacted(network, windows) if isinstance(network, TactileTransformer) else None
+        if not isinstance(network, TactileTransformer):
+            return None
+        return compacted(network, as_tensor(self.train.x))
 
     @cached_property
     def imputation(self) -> CellStatistics | TiledStatistics:

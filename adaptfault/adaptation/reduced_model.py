@@ -19,6 +19,7 @@ from adaptfault.adaptation.contact_moments import ContactMoments
 from adaptfault.data.windows import Windows
 from adaptfault.models.any_model import AnyModel
 from adaptfault.models.heads import Head
+from adaptfault.models.kernels import Views
 from adaptfault.models.network import TactileTransformer
 from diagnostics import FaultSet
 
@@ -74,21 +75,19 @@ class ReducedModel(nn.Module):
             )
         return x if self.front is None else self.front(x)
 
-    def views(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    def views(self, x: Tensor) -> Views:
         """Map windows of the healthy cells ``[N, T, D-k]`` to the input of a head.
 
-        Returns:
-            The features of the network ``[N, p]``, the first two results of
-            :class:`~adaptfault.adaptation.cell_summary.CellSummary`, the
-            :class:`~adaptfault.adaptation.contact_moments.ContactMoments` of the whole windows, and
-            the third summary, the course of each cell. Summaries and moments are those of loads:
-            the readings above the rest of each cell.
+        They are the features of the network, the
+        :class:`~adaptfault.adaptation.contact_moments.ContactMoments` of the whole windows, and the
+        :class:`~adaptfault.adaptation.cell_summary.CellSummary`. Summaries and moments are those of
+        loads: the readings above the rest of each cell.
         """
         rest = self.rest if self.head is None else self.head.rest
         whole = self.complete(x)
-        cells, smooth, course = self.summary(loads(x, rest[self.healthy]))
+        smooth, course = self.summary(loads(x, rest[self.healthy]))
         moments = self.moments(loads(whole, rest))
-        return self.network.features(whole), cells, smooth, moments, course
+        return Views(self.network.features(whole), smooth, moments, course)
 
     def forward(self, x: Tensor) -> Tensor:
         """Map windows of the healthy cells ``[N, T, D-k]``, scaled to 0..1, to logits

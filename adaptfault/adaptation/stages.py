@@ -6,7 +6,7 @@ from __future__ import annotations
 import copy
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Literal
 
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from adaptfault.adaptation.fault_free import FaultFreeModel, Network
-from adaptfault.adaptation.reduced_model import ReducedModel, loads, reduce_windows
+from adaptfault.adaptation.reduced_model import ReducedModel, reduce_windows
 from adaptfault.adaptation.result import Adaptation, Stage
 from adaptfault.data.determination import explained
 from adaptfault.data.windows import Windows, evenly
@@ -26,13 +26,13 @@ from adaptfault.models.forest import fit_forest
 from adaptfault.models.heads import (
     MOST_WINDOWS,
     Head,
-    calibrate,
     fit_head,
     linear_head,
-    log_likelihood,
 )
 from adaptfault.models.history import History
+from adaptfault.models.kernels import Views
 from adaptfault.models.network import as_tensor, logits_of
+from adaptfault.models.targets import calibrate, log_likelihood
 from adaptfault.models.training import train
 from adaptfault.models.value_units import ValueUnits, foldable
 from diagnostics import FaultSet
@@ -136,7 +136,7 @@ class Run:
         network = copy.deepcopy(self.fault_free.model)
         reduced = self._behind(self.fault_free.imputation.linear(self.fault_set), network)
         if self.fault_free.task == "classification" and network.head is not None:
-            features = self._views(reduced, self.training)[0].cpu().double().numpy()
+            features = self._views(reduced, self.training).features.cpu().double().numpy()
             weight, bias = linear_head(features, self.training.y, network.n_classes)
             with torch.no_grad():
                 network.head.weight.copy_(weight)
@@ -271,22 +271,17 @@ class Run:
         first, second = (
             self._views(reduced, of) for of in (self.training.select(used), self.validation)
         )
-        recordings = (self.training.recording[used], self.validation.recording)
-        folds = np.concatenate(
-            [np.unique(of, return_inverse=True)[1] % _FOLDS for of in recordings]
-        )
-        whole = self._whole(self.fault_free.train.select(used), self.fault_free.validation)
+        folds = np.unique(self.validation.recording, return_inverse=True)[1] % _FOLDS
         targets = self.fault_free.targets[used], self.fault_free.validation_targets
-        return self._fit(first, second, *targets, folds, whole)
+        return self._fit(first, second, *targets, folds)
 
     def _fit(
         self,
-        first: Sequence[Tensor],
-        second: Sequence[Tensor],
+        first: Views,
+        second: Views,
         targets: NDArray[np.float32],
         held_targets: NDArray[np.float32],
         folds: NDArray[np.int64],
-        whole: Tensor | None,
         *,
         forest: bool = True,
     ) -> tuple[Head, Tensor]:
@@ -297,21 +292,9 @@ class Run:
             targets,
             held_targets,
             folds,
-            whole=whole,
             rest=self.reduced.rest,
             values=values,
             forest=forest,
-        )
-
-    def _whole(self, *parts: Windows) -> Tensor | None:
-        """Return the moments of windows with all cells, those of F included; None if F is empty."""
-        if not len(self.fault_set):
-            return None
-        return torch.cat(
-            [
-                self.reduced.moments(loads(as_tensor(part.x).to(self.device), self.reduced.rest))
-                for part in parts
-            ]
         )
 
     def _behind(self, front: nn.Module | None, network: Network) -> ReducedModel:
@@ -331,14 +314,14 @@ class Run:
         same.add_module("network", self.quick)
         return same.eval()
 
-    def _views(self, reduced: ReducedModel, windows: Windows) -> tuple[Tensor, ...]:
+    def _views(self, reduced: ReducedModel, windows: Windows) -> Views:
         """Return the views of windows, computed in batches, on the device of the adapter."""
         quick = self._quickly(reduced.eval())
         with torch.no_grad():
             views = [
                 quick.views(x.to(self.device)) for x in torch.split(as_tensor(windows.x), _BATCH)
             ]
-        return tuple(torch.cat(parts) for parts in zip(*views, strict=True))
+        return Views(*(torch.cat(parts) for parts in zip(*views, strict=True)))
 
     def _too_long(self, reduced: ReducedModel, n: int) -> bool:
         """Return whether a head on n windows exceeds the time left, extrapolated from a trial on a
@@ -350,24 +333,21 @@ class Run:
         views = self._views(reduced, few)
         pace = (time.perf_counter() - began) / len(few)
         m = min(n, _PILOT)
-        known = [view[torch.arange(m) % len(few)] for view in views]
+        known = views.select(np.arange(m) % len(few))
         held = m // 5
         k = self.fault_free.targets.shape[1]
         targets = np.eye(k, dtype=np.float32)[np.arange(m) % k]
         if self.fault_free.task == "regression":
             targets = self.fault_free.targets[np.arange(m) % len(self.fault_free.targets)]
         began = time.perf_counter()
-        first = [v[held:] for v in known]
-        second = [v[:held] for v in known]
-        whole = self._whole(self.fault_free.train.select(slice(0, _BATCH)))
-        whole = None if whole is None else whole[torch.arange(m) % len(few)].roll(-held, 0)
-        folds = np.arange(m) % _FOLDS
-        parts = (first, second, targets[held:], targets[:held], folds, whole)
-        self._fit(*parts, forest=False)
+        folds = np.arange(held) % _FOLDS
+        first = known.select(slice(held, None))
+        second = known.select(slice(0, held))
+        self._fit(first, second, targets[held:], targets[:held], folds, forest=False)
         kernels = (time.perf_counter() - began) * (n / m) ** 2.5  # distances (2) and solves (3)
         began = time.perf_counter()
         values = self.fault_free.task == "regression"
-        fit_forest(known[-1].cpu().numpy(), targets, folds[:held], values=values)
+        fit_forest(known.course.cpu().numpy(), targets, folds, values=values)
         trees = (time.perf_counter() - began) * (n / m) ** 1.2  # n log n
         return bool(pace * n + kernels + trees > self.left())
 

@@ -1,9 +1,8 @@
 """Sensitivity to single faults: accuracy lost when a cell, row, column or address bit is stuck (the
 paper's abstract).
 
-The result is exact: each cell is stuck at each value in each window. For the paper's network a
-low-rank form (:mod:`adaptfault.evaluation.stuck_cell_logits`) takes a tenth of the time of full
-passes (a third with unpadded convolutions).
+The result is exact: each cell is stuck at each value in each window. The paper's network runs in
+its low-rank form (:mod:`adaptfault.models.compact`), a fifth of the time.
 """
 
 from __future__ import annotations
@@ -323,17 +322,18 @@ def _answers(model: Classifier | nn.Module, windows: Windows) -> tuple[_Answer, 
     """Return what maps windows, and one window with single cells stuck, to probabilities; and C."""
     from torch import nn
 
+    from adaptfault.models.compact import CompactNetwork
     from adaptfault.models.network import TactileTransformer, logits_of
 
     if isinstance(model, nn.Module):
         module = model
+        if isinstance(model, TactileTransformer) and CompactNetwork.suits(model):
+            module = CompactNetwork(model).to(model.head.weight.device)
 
         def answer(x: NDArray[np.float32]) -> Floats:
             return np.asarray(logits_of(module, x).double().softmax(1).numpy())
 
         n_classes = answer(windows.x[:1]).shape[1]
-        if isinstance(model, TactileTransformer):
-            return answer, _by_coordinates(model), n_classes
     elif callable(getattr(model, "predict", None)):
         classifier = model
         n_classes = int(windows.y.max()) + 2  # the last one stands for any other prediction
@@ -364,26 +364,6 @@ def _one_by_one(answer: _Answer) -> _StuckAnswers:
             stuck[np.arange(len(c)), :, c] = v[:, None]
             parts.append(answer(stuck))
         return np.concatenate(parts)
-
-    return answers
-
-
-def _by_coordinates(model: TactileTransformer) -> _StuckAnswers:
-    """Return the same function for the paper's network, in low-rank form."""
-    import torch
-
-    from adaptfault.evaluation.stuck_cell_logits import StuckCells
-
-    short = StuckCells(model)
-    device = model.head.weight.device
-
-    def answers(
-        window: NDArray[np.float32], cells: NDArray[np.intp], levels: NDArray[np.float32]
-    ) -> Floats:
-        x = torch.from_numpy(window.copy()).to(device)
-        which = torch.from_numpy(cells).to(device)
-        at = torch.from_numpy(levels).to(device)
-        return np.asarray(short.logits(x, which, at).double().softmax(1).cpu().numpy())
 
     return answers
 

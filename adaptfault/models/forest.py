@@ -13,7 +13,7 @@ from sklearn.ensemble import ExtraTreesClassifier, ExtraTreesRegressor
 from torch import Tensor, nn
 
 GROUPS = 5  # of trees, each fitted without one fold of the held-out windows
-TREES = 40  # of a group
+TREES = 20  # of a group
 _DEPTH = 16  # the most splits between a root and a leaf
 
 
@@ -173,7 +173,11 @@ def _grown(x: NDArray[np.float32], targets: NDArray[np.float32], seed: int, valu
     threshold = np.concatenate([tree.threshold for tree in trees])
     outputs = np.concatenate([tree.value for tree in trees])
     outputs = outputs[:, :, 0] if values else outputs[:, 0]
-    rows, row = np.unique(outputs[leaf].astype(np.float32), axis=0, return_inverse=True)
+    said = outputs[leaf].astype(np.float32)
+    # as bytes: that is quicker than by columns
+    whole = np.ascontiguousarray(said).view(f"V{said.itemsize * said.shape[1]}").ravel()
+    _, first, row = np.unique(whole, return_index=True, return_inverse=True)
+    rows = said[first]
     every = np.zeros((len(rows), targets.shape[1]), dtype=np.float32)
     every[:, slice(None) if values else ensemble.classes_] = rows
     rows_of_nodes = np.zeros(len(leaf), dtype=np.int32)

@@ -12,6 +12,7 @@ from adaptfault.adaptation.reduced_model import ReducedModel, loads
 from adaptfault.imputation.linear import AffineFill
 from adaptfault.imputation.tiled_statistics import LARGE
 from adaptfault.models.heads import Head
+from adaptfault.models.kernels import Views
 from diagnostics import FaultSet
 
 
@@ -41,8 +42,7 @@ class Masked(nn.Module):
     """A model with a head in closed form, on all D cells: no shape and no constant depends on F,
     only its state does.
 
-    A dropped cell reads 0 in the windows and in those that the head knows, so it adds nothing to a
-    distance.
+    A dropped cell reads 0.
 
     Args:
         model: with a linear front end or none, and a :class:`~adaptfault.models.heads.Head`;
@@ -75,14 +75,9 @@ class Masked(nn.Module):
         self.summary = CellSummary(layout, FaultSet((), d))
         self.moments = model.moments
         assert isinstance(model.head, Head)
-        features, cells, *others = model.head.known
-        wide = cells.new_zeros(len(cells), 2, int(present.sum()))
-        # means and maxima
-        wide[..., torch.from_numpy(~faults.mask[present])] = cells.view(len(cells), 2, -1)
         own = np.flatnonzero(~faults.mask[present])
         course = np.concatenate([own + i * int(present.sum()) for i in range(COURSE)])
-        forest = model.head.forest.reading(course)
-        self.head = model.head.knowing((features, wide.flatten(1), *others), forest)
+        self.head = model.head.with_forest(model.head.forest.reading(course))
 
     @staticmethod
     def suits(model: ReducedModel) -> bool:
@@ -97,9 +92,8 @@ class Masked(nn.Module):
         filled = nn.functional.linear(known, self.weight, self.bias).clamp(0.0, 1.0)
         whole = torch.where(self.used, x, filled)
         rest = self.head.rest
-        cells, smooth, course = self.summary(torch.where(self.used, loads(x, rest), 0.0))
+        smooth, course = self.summary(torch.where(self.used, loads(x, rest), 0.0))
         features = self.network.features(whole)
-        outputs: Tensor = self.head(
-            (features, cells, smooth, self.moments(loads(whole, rest)), course)
-        )
+        moments = self.moments(loads(whole, rest))
+        outputs: Tensor = self.head(Views(features, smooth, moments, course))
         return outputs if self.values else torch.softmax(outputs, dim=1)

@@ -166,10 +166,11 @@ def _pairs(loads: _Loads, kept: Sequence[int]) -> list[tuple[int, int, int]]:
             projected[k][frames], k=min(_FOUND, len(owner)), distance_upper_bound=near
         )
         for t, places in zip(frames.tolist(), at.reshape(len(frames), -1), strict=True):
-            for hit in places[places < len(owner)].tolist():
+            hits = places[places < len(owner)]
+            for hit in hits[owner[hits] != k].tolist():
                 j = kept[owner[hit]]
                 shifts = found.setdefault((i, j), set())
-                if j == i or len(shifts) == _PLACED:
+                if len(shifts) == _PLACED:
                     continue
                 if _agree(loads.frame(i, t), loads.frame(j, place[hit]), loads.tolerance):
                     shifts.add(int(place[hit]) - t)

@@ -83,3 +83,30 @@ def test_very_large_arrays_are_left_alone(monkeypatch):
     assert CompactNetwork.suits(network)
     monkeypatch.setattr(compact, "_MOST", 700_000)
     assert not CompactNetwork.suits(network)
+
+
+def test_cut_to_windows_it_says_nearly_what_the_network_says_of_such_windows():
+    rng = np.random.default_rng(0)
+    layout = SensorLayout(2, 6, 5)
+    network = restless(TactileTransformer(layout, 3, length=5))
+    place = rng.random((2, 300, 1, 1))  # contacts in few shapes, at a high rest
+    shape = np.exp(-((np.linspace(0, 1, 60) - place[0]) ** 2) * 8) * place[1]
+    x = torch.from_numpy((5 + shape + np.zeros((300, 5, 60))).astype(np.float32))
+    small = compact.CompactNetwork(network, x[:150])
+    with torch.no_grad():
+        expected = network.features(x[150:])
+        found = small.features(x[150:])
+    spread = (expected - expected.mean(0)).square().sum()
+    assert (found - expected).square().sum() < 0.05**2 * spread
+    numbers = [sum(p.numel() for p in of.parameters()) for of in (CompactNetwork(network), small)]
+    assert numbers[1] < 0.5 * numbers[0]
+
+
+def test_few_windows_or_a_large_basis_are_not_worth_the_decomposition(monkeypatch):
+    network = TactileTransformer(MASKED, 3, length=3)
+    x = windows(40, network)
+    assert compact.compacted(network, x) is None
+    monkeypatch.setattr(compact, "_WORTH", 40)
+    assert compact.compacted(network, x) is not None
+    monkeypatch.setattr(compact, "_MOST", 700_000)
+    assert compact.compacted(network, x) is None

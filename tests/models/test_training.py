@@ -319,7 +319,7 @@ def test_a_run_killed_with_kill_9_continues_as_if_nothing_had_happened(tmp_path:
     # environment chooses them.
     environment = {
         **os.environ,
-        "PYTHONPATH": f"{Path(__file__).parent}:{Path(__file__).parents[2]}",
+        "PYTHONPATH": ":".join(map(str, [Path(__file__).parent, *Path(__file__).parents[1:3]])),
     }
     with subprocess.Popen(command, stdout=subprocess.PIPE, env=environment, text=True) as process:
         assert process.stdout is not None

@@ -7,6 +7,7 @@ the loadedness of cell i, both are left out together: the 2 x 2 block is inverte
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -121,4 +122,27 @@ class ConditionalMean:
         for part in self.parts:
             outputs = part.inputs[part.place]
             mean[:, outputs], surely[:, outputs] = part.predict(load, known)
+        return mean, surely
+
+
+@dataclass(frozen=True)
+class CrossFitted:
+    """Conditional means of which none has seen the recordings that it predicts.
+
+    Attributes:
+        means: without each of the folds.
+        fold: int ``[n]``, of each piece.
+    """
+
+    means: Sequence[ConditionalMean]
+    fold: Cells
+
+    def predict(self, load: Array, known: Mask) -> tuple[Array, Array]:
+        """Return what :meth:`ConditionalMean.predict` does; ``load``: of the first pieces."""
+        mean = np.zeros(load.shape, np.float32)
+        surely = np.zeros(load.shape, np.float32)
+        fold = self.fold[: len(load)]
+        for k in np.unique(fold).tolist():
+            of_fold = fold == k
+            mean[of_fold], surely[of_fold] = self.means[k].predict(load[of_fold], known)
         return mean, surely

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from diagnostics.evidence.reference import converter_step
 from diagnostics.layout import SensorLayout
-from diagnostics.model.conditional_mean import ConditionalMean
+from diagnostics.model.conditional_mean import ConditionalMean, CrossFitted
 from diagnostics.model.judge import Model
 from diagnostics.model.predictor import Network, Predictor
 from diagnostics.model.record import Array, Cells, Mask, Record, frames_of_piece, record_of
@@ -48,10 +48,8 @@ _ODD_UNITS = 50.0  # units of all cells that weigh on the share of one
 _RARELY = 1e-3
 _OFTEN = 0.2
 _LOGS = 32
-_LENGTHS = (3, 6, 6, 30)  # recordings of a log
+_LENGTHS = (3, 6, 6, 6, 6, 6, 6, 40)  # recordings of a log
 _DEAD = (0.0, 0.04, 0.08, 0.16)  # shares of the cells that are dead in it
-_CERTAIN = 6.0  # evidence that a healthy cell does not reach
-_SAFETY = 1.5
 _TAIL = 0.995
 
 Recordings = Sequence[NDArray[np.floating]]
@@ -123,9 +121,10 @@ def fit_model(
     predictor.network = Network.fit(inputs, levels, symbols.n)
     progress(0.5)
     model = Model.of(symbols, flatness, predictor, length, present, living)
+    predictor.mean = CrossFitted(means, fold[record.recording])
     model.odd = _odd(model, reference)
     progress(0.6)
-    model.factor = _factor(model, reference, rng)
+    model.highest, model.reached = _highest(model, reference, rng)
     predictor.mean = whole
     progress(1.0)
     return model
@@ -165,44 +164,40 @@ def _examples(
 
 def _odd(model: Model, reference: _Reference) -> Array:
     """Return in which share of its units each healthy cell is odd, ``[D]``."""
-    odd = np.zeros(len(model.present))
-    units = 0
-    for k, mean in enumerate(reference.means):
-        model.predictor.mean = mean
-        held_out = np.flatnonzero(reference.fold == k)
-        log = model.log_of([reference.recordings[i] for i in held_out.tolist()])
-        observed = model.observed(log, model.living & log.received)
-        odd += observed.odd.sum(axis=0)
-        units += len(observed.odd)
+    log = model.log_of_record(reference.record)
+    observed = model.observed(log, model.living & log.received)
+    units = len(observed.odd)
+    odd = observed.odd.sum(axis=0)
     pooled = max(odd[model.living].sum() / max(1, units * model.living.sum()), _RARELY)
     share = (odd + _ODD_UNITS * pooled) / (units + _ODD_UNITS)
     found: Array = np.clip(share, _RARELY, _OFTEN).astype(np.float32)
     return found
 
 
-def _factor(model: Model, reference: _Reference, rng: np.random.Generator) -> Array:
-    """Return the factor on the evidence of each way and cell, ``[ways, D]``, from logs that are
-    held out, with dead cells beside."""
+def _highest(model: Model, reference: _Reference, rng: np.random.Generator) -> tuple[Array, int]:
+    """Return the evidence of each way that healthy cells reach, ``[ways, D]``, in logs that are
+    held out, with dead cells beside, and the units of the longest log."""
     cells = np.flatnonzero(model.living)
     highest = np.zeros((len(WAYS), len(model.present)))
     every = []
+    longest = 1
     for i in range(_LOGS):
-        k = i % len(reference.means)
-        model.predictor.mean = reference.means[k]
-        held_out = np.flatnonzero(reference.fold == k)
-        size = min(len(held_out), _LENGTHS[i // len(reference.means) % len(_LENGTHS)])
-        chosen = rng.choice(held_out, size, replace=False)
-        dead = rng.choice(cells, int(_DEAD[i % len(_DEAD)] * len(cells)), replace=False)
+        size = min(len(reference.recordings), _LENGTHS[i % len(_LENGTHS)])
+        chosen = rng.choice(len(reference.recordings), size, replace=False)
+        share = _DEAD[i // len(_LENGTHS) % len(_DEAD)]
+        dead = rng.choice(cells, int(share * len(cells)), replace=False)
         log = [reference.recordings[j].copy() for j in chosen.tolist()]
         for cell in dead:
             value = rng.uniform(0, 1) * model.symbols.rest.full
             for frames in log:
                 frames[:, cell] = value
-        evidence = model.judge(log).evidence
+        record = record_of(log, model.length)
+        fold = reference.fold[chosen][record.recording]
+        model.predictor.mean = CrossFitted(reference.means, fold)
+        evidence = model.judge_record(record).evidence
         healthy = np.setdiff1d(cells, dead)
         highest[:, healthy] = np.maximum(highest[:, healthy], evidence[:, healthy])
         every.append(evidence[:, healthy])
+        longest = max(longest, len(record.units))
     tail = np.quantile(np.concatenate(every, axis=1), _TAIL, axis=1)
-    highest = np.maximum(highest, tail[:, None])
-    found: Array = (_CERTAIN / np.maximum(_CERTAIN, _SAFETY * highest)).astype(np.float32)
-    return found
+    return np.maximum(highest, tail[:, None]).astype(np.float32), longest

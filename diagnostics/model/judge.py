@@ -32,6 +32,8 @@ from diagnostics.model.ways import WAYS, Way
 _SUSPECT = 3.0  # evidence of a fault with which a cell predicts no other
 _WORST = 0.5  # of the highest evidence: who leaves in one round
 _ROUNDS = 8
+_CERTAIN = 6.0  # evidence that a healthy cell does not reach
+_SAFETY = 1.5
 HELD = 3  # pieces at the end at one load: it may be stuck
 _PREVALENCE = 0.03
 _WEIGHS = 20.0  # cells that the usual prevalence is worth
@@ -78,7 +80,8 @@ class Model:
         length: frames of a piece.
         present, living: bool ``[D]``, cells that there are, and that ever moved.
         odd: ``[D]``, share of the units in which each healthy cell is odd.
-        factor: ``[ways, D]``, on the evidence of each way.
+        highest: ``[ways, D]``, evidence of each way that a healthy cell reaches.
+        reached: units of the longest log in which they did.
     """
 
     symbols: Symbols
@@ -88,7 +91,8 @@ class Model:
     present: Mask
     living: Mask
     odd: Array
-    factor: Array
+    highest: Array
+    reached: int
 
     @classmethod
     def of(
@@ -102,12 +106,18 @@ class Model:
     ) -> Model:
         """Return the model before healthy logs tell how odd cells are."""
         odd = np.full(len(present), USUAL, np.float32)
-        factor = np.ones((len(WAYS), len(present)), np.float32)
-        return cls(symbols, flatness, predictor, length, present, living, odd, factor)
+        highest = np.zeros((len(WAYS), len(present)), np.float32)
+        return cls(symbols, flatness, predictor, length, present, living, odd, highest, 1)
 
-    def log_of(self, recordings: Sequence[NDArray[np.floating]]) -> Log:
-        """Return a log, recordings ``[T, D]``, as symbols."""
-        return self.log_of_record(record_of(recordings, self.length))
+    def _certain(
+        self, evidence: Array, units: Units, chosen: Sequence[int] | slice = slice(None)
+    ) -> Array:
+        """Return evidence of the ``chosen`` ways so that what a healthy cell may reach in a log
+        stays below certainty; it grows with the log."""
+        longer = max(1.0, len(units.begins) / self.reached)
+        most = _SAFETY * longer * self.highest[chosen]
+        found: Array = evidence * np.where(evidence > 0, _CERTAIN / np.maximum(_CERTAIN, most), 1)
+        return found
 
     def log_of_record(self, record: Record) -> Log:
         """Return a record as symbols."""
@@ -119,10 +129,15 @@ class Model:
 
     def judge(self, recordings: Sequence[NDArray[np.floating]]) -> Judgement:
         """Judge a log, recordings ``[T, D]``."""
-        log = self.log_of(recordings)
+        return self.judge_record(record_of(recordings, self.length))
+
+    def judge_record(self, record: Record) -> Judgement:
+        """Judge a record, with pieces of this model's length."""
+        log = self.log_of_record(record)
         observed = self._by_trusted(log)
         units = Units.of(observed, self.odd)
-        evidence = np.stack([way.evidence(observed, units) for way in WAYS]) * self.factor
+        evidence = np.stack([way.evidence(observed, units) for way in WAYS])
+        evidence = self._certain(evidence, units)
         log_odds: Floats = logit(_PREVALENCE) + _of_any(evidence, WAYS)
         # what never moved, here or in the reference, and rests: nothing is known of it
         judged = log.received & (self.living | (log.level[-1] > 0))
@@ -149,7 +164,7 @@ class Model:
             known = observed.known
             units = Units.of(observed, self.odd)
             each = np.stack([way.evidence(observed, units) for way in ways])
-            evidence = _of_any(each * self.factor[deciding], ways)
+            evidence = _of_any(self._certain(each, units, deciding), ways)
             suspect = known & (evidence > _SUSPECT)
             if suspect.any():
                 observed = self.observed(log, known & ~self._worst(suspect, known, evidence))

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from diagnostics.layout import SensorLayout
-from diagnostics.model.conditional_mean import ConditionalMean, loaded
+from diagnostics.model.conditional_mean import ConditionalMean, CrossFitted, loaded
 from diagnostics.model.record import Array, Cells, Mask
 from diagnostics.model.symbols import NOTHING
 
@@ -93,7 +93,7 @@ class Predictor:
         rings: ``[D, D]`` each, the cells beside each one, by distance.
         beside: int ``[D, k]``, cells beside each one; -1: none.
         usual: ``[D, k]``, how often and how much each cell is loaded.
-        mean: the conditional mean; those of the folds take turns while the model is fitted.
+        mean: the conditional mean; those of the folds while the model is fitted.
         network: None: not fitted yet.
     """
 
@@ -102,7 +102,7 @@ class Predictor:
     rings: Sequence[Array]
     beside: Cells
     usual: Array
-    mean: ConditionalMean
+    mean: ConditionalMean | CrossFitted
     network: Network | None = None
 
     @classmethod

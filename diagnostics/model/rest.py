@@ -25,6 +25,8 @@ NARROW = 0.002  # of full scale: readings differ by it without a load
 _FEWEST = 6  # cells of a pad that tell what it shares
 _EVEN = 0.5  # of a negative offset: by which the cells that share it differ
 _NOISES = 3.0  # by which those that share a positive one differ; a contact may be even, too
+_RESTS = 0.25  # share of the recordings in which a cell rests at some time
+_WIDER = 3.0  # at most, than the interval that holds so many, one that holds twice as many is
 _UNSTEADY = 0.05  # of full scale: the rest of a cell differs between recordings by less
 
 
@@ -55,7 +57,7 @@ class Rest:
             tell = np.flatnonzero(cells & telling)
             if len(tell) < _FEWEST:
                 continue
-            middle, width = shortest_half(record.mean[:, tell] - self.level[tell])
+            middle, width = shortest(record.mean[:, tell] - self.level[tell], 0.5)
             noise = float(np.median(self.near[tell]))
             below = np.maximum(noise, _EVEN * -middle)
             limit = np.where(middle < 0, below, _NOISES * noise)
@@ -66,8 +68,11 @@ class Rest:
 
     def above(self, record: Record, telling: Mask) -> Array:
         """Return how far each piece reads above the rest of the cell without what its pad shares,
-        ``[n, D]``."""
-        found: Array = record.mean - self.level - self.offset(record, telling)
+        ``[n, D]``. Cells that share less than others read more, those that share more no less."""
+        offset = self.offset(record, telling)
+        above = record.mean - self.level - offset
+        uneven = _EVEN * np.maximum(-offset, 0)
+        found: Array = np.where(above < 0, np.minimum(above + uneven, 0), above)
         return found
 
 
@@ -84,7 +89,9 @@ def fit_rest(record: Record, full: float, step: float, pad: Cells, living: Mask)
         without = record.mean - rest.offset(record, living)
         level = _lowest(without, first)
         lowest = np.fmin.reduceat(without, first, axis=0)
-        spread = np.nanquantile(lowest, 0.5, axis=0) - np.nanquantile(lowest, 0.1, axis=0)
+        quarter = shortest(lowest.T, _RESTS)[1]
+        half = shortest(lowest.T, 2 * _RESTS)[1]
+        spread = np.minimum(half, _WIDER * quarter)
         range_ = record.high - record.low
         resting = np.where(without <= level + 2 * spread, range_, np.nan)
         noise = np.nan_to_num(np.nanmedian(resting, axis=0))
@@ -95,20 +102,21 @@ def fit_rest(record: Record, full: float, step: float, pad: Cells, living: Mask)
 
 
 def _lowest(readings: Array, first: Cells) -> Array:
-    """Return the typical lowest reading of a recording, ``[D]``; ``first``: first pieces."""
+    """Return the usual lowest reading of a recording, ``[D]``; ``first``: first pieces. Some of the
+    recordings show it, however many begin and end in a contact."""
     lowest = np.fmin.reduceat(readings, first, axis=0)
-    found: Array = np.nan_to_num(np.nanquantile(lowest, 0.25, axis=0)).astype(np.float32)
+    found: Array = np.nan_to_num(shortest(lowest.T, _RESTS)[0]).astype(np.float32)
     return found
 
 
-def shortest_half(values: Array) -> tuple[Array, Array]:
-    """Return middle and width of the shortest interval that holds half of the values of each row,
-    ``[n]`` each of ``[n, k]``."""
+def shortest(values: Array, share: float) -> tuple[Array, Array]:
+    """Return middle and width of the shortest interval that holds a share of the values of each
+    row, ``[n]`` each of ``[n, k]``."""
     ordered = np.sort(values, axis=1)
-    half = values.shape[1] // 2
-    widths = ordered[:, half:] - ordered[:, : values.shape[1] - half]
+    held = int(share * values.shape[1])
+    widths = ordered[:, held:] - ordered[:, : values.shape[1] - held]
     widths = np.where(np.isnan(widths), np.inf, widths)
     at = widths.argmin(axis=1)
     row = np.arange(len(values))
-    middle = (ordered[row, at] + ordered[row, at + half]) / 2
+    middle = (ordered[row, at] + ordered[row, at + held]) / 2
     return middle, widths[row, at]

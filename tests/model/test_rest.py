@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from diagnostics import SensorLayout
 from diagnostics.evidence.reference import converter_step
 from diagnostics.model.record import record_of
-from diagnostics.model.rest import fit_rest, shortest_half
+from diagnostics.model.rest import fit_rest, shortest
 
 PAD = np.repeat([0, 1], 12)
 
@@ -25,9 +25,9 @@ def touched(seed: int) -> list[np.ndarray]:
 
 
 @given(st.lists(st.floats(-1e3, 1e3), min_size=2, max_size=30))
-def test_the_shortest_half_is_no_wider_than_any_other(values):
+def test_the_shortest_interval_is_no_wider_than_any_other(values):
     row = np.array([values], dtype=np.float32)
-    middle, width = shortest_half(row)
+    middle, width = shortest(row, 0.5)
     ordered = np.sort(row[0])
     half = len(ordered) // 2
     others = ordered[half:] - ordered[: len(ordered) - half]

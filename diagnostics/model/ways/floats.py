@@ -13,7 +13,7 @@ from diagnostics.faults import FaultKind
 from diagnostics.model.observed import Observed
 from diagnostics.model.over_time import Units, for_good, since
 from diagnostics.model.record import Array, Cells
-from diagnostics.model.symbols import CONSTANT, MOVES
+from diagnostics.model.symbols import MOVES
 from diagnostics.model.ways.way import Way
 
 _WEIGHS = 2.0  # pieces that any symbol is worth
@@ -24,13 +24,13 @@ def _ratio(observed: Observed) -> Array:
     log = observed.log
     n, d = log.level.shape
     kinds = log.symbols.n * (MOVES + 1)
-    symbol = log.level.astype(np.intp) * (MOVES + 1) + log.flat
+    rests = log.level == 0
+    # how flat a cell rests tells nothing of who moves it
+    symbol = np.where(rests, 0, log.level.astype(np.intp) * (MOVES + 1) + log.flat)
     of_cell = symbol + kinds * np.arange(d)
     count = np.bincount(of_cell.ravel(), minlength=kinds * d)[of_cell] - 1
     own = (count + _WEIGHS / kinds + _LEAST) / (n - 1 + _WEIGHS + _LEAST * kinds)
-    # a cell that rests is no less a healthy one for being quiet
-    quiet = (log.level == 0) & (log.flat == CONSTANT)
-    found: Array = np.log(own) - np.where(quiet, observed.of_level, observed.healthy)
+    found: Array = np.log(own) - np.where(rests, observed.of_level, observed.healthy)
     return found * log.record.received
 
 

@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from diagnostics.model.observed import Observed
-from diagnostics.model.record import Array, Cells
+from diagnostics.model.record import Array, Cells, Mask
 
 USUAL = 0.01  # share of the units in which a healthy cell is odd, before the reference tells
 _SURE = 30.0  # cells that this share is worth
@@ -35,11 +35,13 @@ class Units:
         begins: int ``[units]``, first piece of each.
         of_piece: int ``[n]``, unit of each piece.
         odd: ``[units, D]``, P(a healthy cell is odd).
+        opens: bool ``[units]``, whether a recording begins with it.
     """
 
     begins: Cells
     of_piece: Cells
     odd: Array
+    opens: Mask
 
     @classmethod
     def of(cls, observed: Observed, odd: Array) -> Units:
@@ -49,7 +51,7 @@ class Units:
         strange = (observed.odd & known).sum(axis=1)
         share = (strange + _SURE * USUAL) / (known.sum() + _SURE)
         here = np.clip(share[:, None] / USUAL * odd, _RARELY, _OFTEN)
-        return cls(record.units, record.of_unit, here)
+        return cls(record.units, record.of_unit, here, record.first[record.units])
 
     def of_units(self, ratio: Array) -> Array:
         """Return the evidence of each unit ``[units, D]`` of log ratios ``[n, D]``."""
@@ -108,14 +110,17 @@ def since(ratio: Array, units: Units) -> Cells:
 
 def now_and_then(ratio: Array, units: Units) -> Array:
     """Return the evidence ``[D]`` of a fault that comes and goes: a two-state Markov chain over the
-    units (forward algorithm, Rabiner 1989)."""
+    units of a recording (forward algorithm, Rabiner 1989), which begins anew with each."""
     # a healthy cell that is odd now and then is what this fault looks like
     doubted = replace(units, odd=np.maximum(units.odd, USUAL))
     likelihood = np.exp(doubted.of_units(ratio))
-    gone = np.full(ratio.shape[1], _FAILS / (_FAILS + _RECOVERS))
+    usual = _FAILS / (_FAILS + _RECOVERS)
+    gone = np.full(ratio.shape[1], usual)
     total: Array = np.zeros(ratio.shape[1], np.float32)
-    for unit in likelihood:
+    for opens, unit in zip(units.opens.tolist(), likelihood, strict=True):
         gone = gone * (1 - _RECOVERS) + (1 - gone) * _FAILS
+        if opens:
+            gone = np.full_like(gone, usual)
         z = 1 - gone + gone * unit
         total = total + np.log(z).astype(np.float32)
         gone = gone * unit / z

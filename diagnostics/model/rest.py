@@ -23,6 +23,7 @@ from diagnostics.model.record import Array, Cells, Mask, Record
 
 NARROW = 0.002  # of full scale: readings differ by it without a load
 _FEWEST = 6  # cells of a pad that tell what it shares
+_STILL = 0.01  # of full scale: a value that is held, with a dither
 _EVEN = 0.5  # of a negative offset: by which the cells that share it differ
 _NOISES = 3.0  # by which those that share a positive one differ; a contact may be even, too
 _RESTS = 0.25  # share of the recordings in which a cell rests at some time
@@ -52,9 +53,12 @@ class Rest:
         """Return the offset of each cell's pad in each piece, ``[n, D]``; ``telling``: bool
         ``[D]``, cells that are received and live."""
         found = np.zeros(record.mean.shape, np.float32)
+        stuck = self._stuck(record)
         for pad in np.unique(self.pad).tolist():
             cells = self.pad == pad
-            tell = np.flatnonzero(cells & telling)
+            tell = np.flatnonzero(cells & telling & ~stuck)
+            if 2 * len(tell) <= (cells & telling).sum():
+                tell = np.flatnonzero(cells & telling)
             if len(tell) < _FEWEST:
                 continue
             middle, width = shortest(record.mean[:, tell] - self.level[tell], 0.5)
@@ -64,6 +68,14 @@ class Rest:
             # twice as wide, nothing is shared; between, a part: a jump would look like a load
             shared = middle * np.clip(2 - width / limit, 0, 1)
             found[:, cells] = np.nan_to_num(shared)[:, None]
+        return found
+
+    def _stuck(self, record: Record) -> Mask:
+        """Return the cells that hold one value away from rest throughout, bool ``[D]``: where most
+        of their pad do not, they share nothing with it."""
+        ranges = np.fmax.reduce(record.high) - np.fmin.reduce(record.low)
+        away = np.abs(record.mean[0] - self.level) > self.near
+        found: Mask = away & (ranges <= _STILL * self.full)
         return found
 
     def above(self, record: Record, telling: Mask) -> Array:

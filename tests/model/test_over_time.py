@@ -14,7 +14,8 @@ ODD = 0.01
 def units(pieces: int, odd: float = ODD) -> Units:
     of_piece = np.arange(pieces) // UNIT
     begins = np.flatnonzero(np.diff(of_piece, prepend=-1))
-    return Units(begins, of_piece, np.full((len(begins), 1), odd))
+    opens = np.arange(len(begins)) == 0
+    return Units(begins, of_piece, np.full((len(begins), 1), odd), opens)
 
 
 RATIOS = st.lists(st.floats(-200, 200), min_size=1, max_size=40).map(

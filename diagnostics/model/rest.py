@@ -26,8 +26,8 @@ _FEWEST = 6  # cells of a pad that tell what it shares
 _STILL = 0.01  # of full scale: a value that is held, with a dither
 _EVEN = 0.5  # of a negative offset: by which the cells that share it differ
 _NOISES = 3.0  # by which those that share a positive one differ; a contact may be even, too
-_RESTS = 0.25  # share of the recordings in which a cell rests at some time
-_WIDER = 3.0  # at most, than the interval that holds so many, one that holds twice as many is
+_RESTS = 0.25  # share of the recordings in which a cell rests at some time, at least
+_WIDER = 3.0  # than their interval is the spread of all, where these rest and others do not
 _UNSTEADY = 0.05  # of full scale: the rest of a cell differs between recordings by less
 
 
@@ -93,17 +93,13 @@ def fit_rest(record: Record, full: float, step: float, pad: Cells, living: Mask)
     ``[D]``."""
     first = np.flatnonzero(record.first)
     least = max(NARROW * full, 2 * step)
-    level = _lowest(record.mean, first)
+    level, _ = _lowest(record.mean, first, least)
     near = np.full_like(level, least)
     high = np.fmax.reduce(record.high)
     rest = Rest(level, near, full, high, pad)
     for _ in range(2):
         without = record.mean - rest.offset(record, living)
-        level = _lowest(without, first)
-        lowest = np.fmin.reduceat(without, first, axis=0)
-        quarter = shortest(lowest.T, _RESTS)[1]
-        half = shortest(lowest.T, 2 * _RESTS)[1]
-        spread = np.minimum(half, _WIDER * quarter)
+        level, spread = _lowest(without, first, least)
         range_ = record.high - record.low
         resting = np.where(without <= level + 2 * spread, range_, np.nan)
         noise = np.nan_to_num(np.nanmedian(resting, axis=0))
@@ -113,12 +109,19 @@ def fit_rest(record: Record, full: float, step: float, pad: Cells, living: Mask)
     return rest
 
 
-def _lowest(readings: Array, first: Cells) -> Array:
-    """Return the usual lowest reading of a recording, ``[D]``; ``first``: first pieces. Some of the
-    recordings show it, however many begin and end in a contact."""
+def _lowest(readings: Array, first: Cells, least: float) -> tuple[Array, Array]:
+    """Return the usual lowest reading of a recording and how it differs between them, ``[D]`` each;
+    ``first``: first pieces; ``least``: readings this close are the same.
+
+    Where some recordings agree much better than all do, the others begin and end in a contact.
+    """
     lowest = np.fmin.reduceat(readings, first, axis=0)
-    found: Array = np.nan_to_num(shortest(lowest.T, _RESTS)[0]).astype(np.float32)
-    return found
+    middle, width = shortest(lowest.T, _RESTS)
+    low, usual, median = np.nan_to_num(np.nanquantile(lowest, [0.1, 0.25, 0.5], axis=0))
+    spread = median - low
+    agree = _WIDER * np.maximum(width, least) < spread
+    level = np.where(agree, middle, usual).astype(np.float32)
+    return level, np.where(agree, _WIDER * width, spread).astype(np.float32)
 
 
 def shortest(values: Array, share: float) -> tuple[Array, Array]:

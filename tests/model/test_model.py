@@ -104,6 +104,16 @@ def test_a_cell_that_repeats_the_one_beside_it_is_a_copy_of_it(fitted):
     assert (fault.cells, fault.kind, fault.value) == ((27,), FaultKind.COPY, 35)
 
 
+def test_nobody_is_blamed_beside_cells_that_move_by_themselves_however_long_the_log(fitted):
+    log = presses(4, 40)
+    rng = np.random.default_rng(5)
+    dead = [1, 14, 27, 44, 51]
+    swing = 1000 + 400 * np.cumsum(rng.normal(0, 0.1, (2400, len(dead))), axis=0)
+    for i, frames in enumerate(log):
+        frames[:, dead] = np.clip(swing[60 * i :][:60], 0, 4095).round()
+    assert blamed(fitted, log) == dead
+
+
 def test_a_dead_row_is_one_fault(fitted, healthy):
     for frames in healthy:
         frames[:, 16:24] = REST

@@ -11,10 +11,10 @@ from diagnostics.model.record import UNIT
 ODD = 0.01
 
 
-def units(pieces: int, odd: float = ODD) -> Units:
+def units(pieces: int, odd: float = ODD, recordings: int = 1) -> Units:
     of_piece = np.arange(pieces) // UNIT
     begins = np.flatnonzero(np.diff(of_piece, prepend=-1))
-    opens = np.arange(len(begins)) == 0
+    opens = np.arange(len(begins)) % -(-len(begins) // recordings) == 0
     return Units(begins, of_piece, np.full((len(begins), 1), odd), opens)
 
 
@@ -51,3 +51,18 @@ def test_what_comes_and_goes_is_found_where_what_lasts_is_not():
     ratio = np.where(on, 3.0, -3.0)[:, None]
     assert now_and_then(ratio, units(80))[0] > 4
     assert throughout(ratio, units(80))[0] == pytest.approx(0, abs=1e-6)
+
+
+@given(st.permutations(range(6)), st.lists(st.floats(-5, 5), min_size=96, max_size=96))
+def test_what_comes_and_goes_does_not_depend_on_the_order_of_recordings(order, ratios):
+    ratio = np.array(ratios)[:, None]
+    of_recording = ratio.reshape(6, 2 * UNIT, 1)
+    again = of_recording[list(order)].reshape(-1, 1)
+    of = units(96, recordings=6)
+    np.testing.assert_allclose(now_and_then(again, of), now_and_then(ratio, of), atol=1e-4)
+
+
+def test_a_fault_of_whole_recordings_is_found_however_few_of_them_have_it():
+    dead = np.repeat(np.arange(12) % 3 == 2, 3 * UNIT)
+    ratio = np.where(dead, 0.3, -3.0)[:, None]
+    assert now_and_then(ratio, units(len(ratio), recordings=12))[0] > 4

@@ -48,6 +48,38 @@ def test_a_pad_that_sags_as_a_whole_is_told_by_how_much_and_the_other_is_not():
     np.testing.assert_allclose(rest.level, 100, atol=3)
 
 
+def test_recordings_that_begin_and_end_in_a_contact_rest_where_some_do():
+    healthy = touched(0)
+    rng = np.random.default_rng(3)
+    for frames in healthy[:8]:
+        frames[:, :4] += rng.uniform(100, 400, 4)
+    rest = fit_rest(record_of(healthy, 8), 1000.0, 1.0, PAD, np.ones(24, bool))
+    np.testing.assert_allclose(rest.level, 100, atol=5)
+    assert rest.near.max() < 20
+
+
+def test_a_cell_that_shares_more_of_a_sag_than_others_reads_nothing_below_rest():
+    living = np.ones(24, bool)
+    rest = fit_rest(record_of(touched(0), 8), 1000.0, 1.0, PAD, living)
+    log = touched(1)
+    for frames in log:
+        frames[:, 12:] -= np.linspace(30, 50, 12)
+    above = rest.above(record_of(log, 8), living)
+    assert (above[:, 12:] >= -rest.near[12:]).all()
+
+
+def test_cells_that_are_stuck_tell_nothing_of_the_offset_of_their_pad():
+    living = np.ones(24, bool)
+    rest = fit_rest(record_of(touched(0), 8), 1000.0, 1.0, PAD, living)
+    log = touched(1)
+    stuck = np.linspace(200, 900, 5)
+    for frames in log:
+        frames[:, 12:] += np.linspace(-52, -28, 12)
+        frames[:, 19:] = stuck
+    offset = rest.offset(record_of(log, 8), living)
+    np.testing.assert_allclose(offset[:, 12:], -43, atol=6)
+
+
 def test_the_step_of_the_converter_is_the_smallest_usual_difference():
     readings = [(np.arange(200) % 13 * 4.0)[:, None]]
     assert converter_step(readings, SensorLayout(1, 1, 1, full_scale=100.0)) == 4.0

@@ -158,7 +158,9 @@ class Head(nn.Module):
         outputs = [
             kernel @ weights.double() + self.bias
             for kernel, weights in zip(
-                kernels(self.known, self.widths, views), self.weights, strict=True
+                kernels(self.known, self.widths, views, values=self.values),
+                self.weights,
+                strict=True,
             )
         ]
         experts = [
@@ -203,7 +205,7 @@ def fit_head(
     both = training + held
     units = _units(both.moments)
     known = _known(both._replace(moments=both.moments / units))
-    of_windows = Kernels(known)
+    of_windows = Kernels(known, values=values)
     on = known.moments.device
     all_weights = []
     all_held = []

@@ -4,7 +4,8 @@ Distances are in units of their medians. The joint kernel is exp(-(f + s + m) / 
 squared distances of the features of the network and of the smoothed cells, m the sum of the
 distances of the moments in each coordinate. The kernel of the moments is exp(-m). A Gaussian suits
 what changes smoothly, a Laplacian kernel what hangs on single values: it is the limit of a forest
-of random trees (Balog, Lakshminarayanan, Ghahramani, Roy and Teh 2016).
+of random trees (Balog, Lakshminarayanan, Ghahramani, Roy and Teh 2016). Values, such as a force,
+change smoothly with the moments: for them, m is a squared distance, too.
 """
 
 from __future__ import annotations
@@ -57,7 +58,9 @@ class Known(NamedTuple):
     moments: Tensor
 
 
-def kernels(known: Known, widths: Tensor, views: Views) -> tuple[Tensor, Tensor]:
+def kernels(
+    known: Known, widths: Tensor, views: Views, *, values: bool = False
+) -> tuple[Tensor, Tensor]:
     """Return the joint kernel and that of the moments between windows, double ``[N, M]`` each.
 
     Double precision: large weights of both signs nearly cancel; the error in single precision is up
@@ -67,11 +70,15 @@ def kernels(known: Known, widths: Tensor, views: Views) -> tuple[Tensor, Tensor]
         known: M windows.
         widths: ``[3]``, units of the distances.
         views: N windows.
+        values: the outputs are values, not classes.
     """
     features, smooth, moments = widths.double()
     of_features = squared(views.features.double(), known.features.double()) / features
     of_smooth = squared(views.smooth.double(), known.smooth.double()) / smooth
-    of_moments = amounts(views.moments, known.moments).double() / moments
+    if values:
+        of_moments = squared(views.moments.double(), known.moments.double()) / moments
+    else:
+        of_moments = amounts(views.moments, known.moments).double() / moments
     joint = torch.exp(-(of_features + of_smooth + of_moments) / len(Known._fields))
     return joint, torch.exp(-of_moments)
 
@@ -81,6 +88,7 @@ class Kernels:
 
     Args:
         known: their views.
+        values: the outputs are values, not classes.
 
     Attributes:
         widths: ``[3]``, the units of the distances.
@@ -89,7 +97,7 @@ class Kernels:
         ValueError: a view is not finite.
     """
 
-    def __init__(self, known: Known) -> None:
+    def __init__(self, known: Known, *, values: bool = False) -> None:
         if not all(bool(view.square().sum().isfinite()) for view in known):
             raise ValueError(
                 "the network gives features that are not finite: check the recordings, and train"
@@ -97,12 +105,17 @@ class Kernels:
             )
         self._smooth = [_centred(known.features), _centred(known.smooth)]
         self._moments = known.moments
+        self._power = 2 if values else 1
         sample = evenly(len(known.moments), SAMPLE)
-        pairs = nn.functional.pdist(known.moments[sample], p=1)
+        pairs = self._apart(known.moments[sample])
         widths = [1.0, 1.0, (float(pairs.median()) if len(pairs) else 0.0) or 1.0]
         for i, view in enumerate(self._smooth):
             widths[i], self._smooth[i] = _unit(view, sample)
         self.widths = torch.tensor(widths, device=known.moments.device)
+
+    def _apart(self, moments: Tensor) -> Tensor:
+        """Return the distance of each pair of rows."""
+        return nn.functional.pdist(moments, p=self._power).pow_(self._power)
 
     def upper(self, *, joint: bool) -> Tensor:
         """Return the upper triangle of the joint kernel, or of that of the moments, ``[M, M]``.
@@ -117,7 +130,7 @@ class Kernels:
             views = [
                 view / math.sqrt(scale) for view, scale in zip(self._smooth, scales, strict=True)
             ]
-        pairs = nn.functional.pdist(self._moments / amount, p=1)
+        pairs = self._apart(self._moments / amount ** (1 / self._power))
         kernel = torch.zeros(n, n, device=pairs.device)
         first = 0
         for start in range(0, n, _ROWS):

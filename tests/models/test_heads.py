@@ -278,10 +278,12 @@ def test_moments_count_in_their_own_units():
     torch.testing.assert_close(found[0], found[1], atol=1e-3, rtol=0)
 
 
-def test_the_kernels_of_a_fit_are_those_of_a_prediction():
+@pytest.mark.parametrize("values", [False, True])
+def test_the_kernels_of_a_fit_are_those_of_a_prediction(values):
     views, _ = windows(300)
     known = Known(*views[:3])
-    fit = Kernels(known)
-    for joint, expected in zip((True, False), kernels(known, fit.widths, views), strict=True):
+    fit = Kernels(known, values=values)
+    predicted = kernels(known, fit.widths, views, values=values)
+    for joint, expected in zip((True, False), predicted, strict=True):
         found = fit.upper(joint=joint).triu()
         torch.testing.assert_close(found.double(), expected.triu(), atol=1e-5, rtol=0)

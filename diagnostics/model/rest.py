@@ -27,7 +27,7 @@ _STILL = 0.01  # of full scale: a value that is held, with a dither
 _EVEN = 0.5  # of a negative offset: by which the cells that share it differ
 _NOISES = 3.0  # by which those that share a positive one differ; a contact may be even, too
 _RESTS = 0.25  # share of the recordings in which a cell rests at some time, at least
-_WIDER = 3.0  # than their interval is the spread of all, where these rest and others do not
+_WIDER = 8.0  # than their interval is the spread of all, where these rest and others do not
 _UNSTEADY = 0.05  # of full scale: the rest of a cell differs between recordings by less
 
 

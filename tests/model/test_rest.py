@@ -55,7 +55,7 @@ def test_recordings_that_begin_and_end_in_a_contact_rest_where_some_do():
         frames[:, :4] += rng.uniform(100, 400, 4)
     rest = fit_rest(record_of(healthy, 8), 1000.0, 1.0, PAD, np.ones(24, bool))
     np.testing.assert_allclose(rest.level, 100, atol=5)
-    assert rest.near.max() < 20
+    assert rest.near.max() < 50  # the lightest load is 100
 
 
 def test_a_cell_that_shares_more_of_a_sag_than_others_reads_nothing_below_rest():

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from diagnostics.model.predictor import Predictor
 from diagnostics.model.record import Array, Mask, Record
+from diagnostics.model.rest import DITHER
 from diagnostics.model.symbols import (
-    DITHER,
     MOVES,
     NOTHING,
     Flatness,

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -150,8 +151,13 @@ class Predictor:
 
     def on_pad(self, values: Array) -> Array:
         """Return the sum of values ``[..., D]`` over the pad of each cell, ``[..., D]``."""
-        of_pad = np.equal(self.pad[:, None], np.arange(self.pad.max() + 1)).astype(np.float32)
-        found: Array = (values @ of_pad)[..., self.pad]
+        found: Array = (values @ self._of_pad)[..., self.pad]
+        return found
+
+    @cached_property
+    def _of_pad(self) -> Array:
+        """Return which cells each pad has, ``[D, pads]``."""
+        found: Array = np.equal(self.pad[:, None], np.arange(self.pad.max() + 1)).astype(np.float32)
         return found
 
     def __call__(self, load: Array, own: Array, first: Mask, known: Mask) -> Array:

@@ -22,8 +22,8 @@ import numpy as np
 from diagnostics.model.record import Array, Cells, Mask, Record
 
 NARROW = 0.002  # of full scale: readings differ by it without a load
+DITHER = 0.01  # of full scale: a stuck value with the dither of its converter
 _FEWEST = 6  # cells of a pad that tell what it shares
-_STILL = 0.01  # of full scale: a value that is held, with a dither
 _EVEN = 0.5  # of a negative offset: by which the cells that share it differ
 _NOISES = 3.0  # by which those that share a positive one differ; a contact may be even, too
 _RESTS = 0.25  # share of the recordings in which a cell rests at some time, at least
@@ -56,9 +56,10 @@ class Rest:
         stuck = self._stuck(record)
         for pad in np.unique(self.pad).tolist():
             cells = self.pad == pad
-            tell = np.flatnonzero(cells & telling & ~stuck)
-            if 2 * len(tell) <= (cells & telling).sum():
-                tell = np.flatnonzero(cells & telling)
+            tell = np.flatnonzero(cells & telling)
+            live = tell[~stuck[tell]]
+            if 2 * len(live) > len(tell):
+                tell = live
             if len(tell) < _FEWEST:
                 continue
             middle, width = shortest(record.mean[:, tell] - self.level[tell], 0.5)
@@ -75,7 +76,7 @@ class Rest:
         of their pad do not, they share nothing with it."""
         ranges = np.fmax.reduce(record.high) - np.fmin.reduce(record.low)
         away = np.abs(record.mean[0] - self.level) > self.near
-        found: Mask = away & (ranges <= _STILL * self.full)
+        found: Mask = away & (ranges <= DITHER * self.full)
         return found
 
     def above(self, record: Record, telling: Mask) -> Array:

@@ -11,10 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from diagnostics.model.record import Array, Cells, Mask, Record
-from diagnostics.model.rest import Rest
+from diagnostics.model.rest import DITHER, Rest
 
 NOTHING = 1e-3  # root load up to which a cell is unloaded
-DITHER = 0.01  # of full scale: a stuck value with the dither of its converter
 HOLDS = 0.6  # dithers: readings this close to a value hold it
 CONSTANT, DITHERS, MOVES, BEGINS = range(4)  # how flat; before the first piece of a recording
 AT_REST, LOADED, AT_TOP, BELOW = range(4)  # groups of levels

@@ -43,6 +43,8 @@ if TYPE_CHECKING:
         FaultTolerantClassifier,
         FaultTolerantRegressor,
     )
+    from adaptfault.inspection.findings import Findings
+    from adaptfault.inspection.guard import GuardError, guard
     from adaptfault.inspection.inspection import Finding, Inspection, inspect
     from adaptfault.models.builders import allow_model, build_model
     from adaptfault.models.history import History
@@ -72,9 +74,11 @@ __all__ = [
     "FaultTolerantClassifier",
     "FaultTolerantRegressor",
     "Finding",
+    "Findings",
     "Fleet",
     "FleetReport",
     "Forecast",
+    "GuardError",
     "History",
     "Inference",
     "Inspection",
@@ -101,6 +105,7 @@ __all__ = [
     "correct",
     "diagnostic_array",
     "evaluate",
+    "guard",
     "inspect",
     "load",
     "load_adapter",
@@ -135,9 +140,11 @@ _HOMES = {
     "FaultTolerantClassifier": "imputation.scikit_learn",
     "FaultTolerantRegressor": "imputation.scikit_learn",
     "Finding": "inspection.inspection",
+    "Findings": "inspection.findings",
     "Fleet": "fleet.listing",
     "FleetReport": "fleet.summary",
     "Forecast": "adaptation.forecast",
+    "GuardError": "inspection.guard",
     "History": "models.history",
     "Inference": "prediction.inference",
     "Inspection": "inspection.inspection",
@@ -168,6 +175,7 @@ _HOMES = {
     "correct": "adaptation.baselines.correction",
     "diagnostic_array": "robot.ros_diagnostics",
     "evaluate": "evaluation.scores",
+    "guard": "inspection.guard",
     "inspect": "inspection.inspection",
     "load": "data.recordings",
     "load_adapter": "adaptation.adapter_files",

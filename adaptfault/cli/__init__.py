@@ -23,6 +23,7 @@ GROUP = "adaptfault.commands"
 BUILT_IN = {
     "info": "adaptfault.cli.info",
     "check": "adaptfault.cli.check",
+    "explain": "adaptfault.cli.explain",
     "convert": "adaptfault.cli.convert",
     "view": "adaptfault.cli.view",
     "simulate": "adaptfault.cli.simulate",

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from functools import partial
 from itertools import islice
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Literal
 
 from adaptfault.cli.command import option
 from adaptfault.cli.inspecting import Inspecting, inspect_log, text_of, write_page
 from adaptfault.cli.paths import Read, Written, WrittenRecordings
-from adaptfault.cli.reading import report_range, summary_of
+from adaptfault.cli.reading import report_range
 from adaptfault.cli.shared_options import (
     cache_option,
     count_from_option,
@@ -19,13 +20,8 @@ from adaptfault.cli.shared_options import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from numpy.typing import NDArray
-
     from adaptfault.data.recordings import Opened, Recordings
     from adaptfault.inspection.data_set import DataSetCheck
-    from adaptfault.inspection.inspection import Inspection
 
 
 class Check(Inspecting):
@@ -35,6 +31,8 @@ class Check(Inspecting):
   adaptfault check my_lerobot_data/ --html health.html --badge health.svg
   adaptfault check grasps.zarr --healthy 0:20 --write-valid valid.zarr
       the first 20 recordings are known to be healthy: the others are compared with them
+  adaptfault check my_lerobot_data/ --format github --fail-on error
+      in CI; adaptfault explain CODE says what a code means
       exit code: 0 fine; 1 single cells, or something to know before training; 2 a wire, or
       a tenth of the cells; 3 unusable input"""
     one_of = ("reference", "healthy")
@@ -53,12 +51,24 @@ class Check(Inspecting):
     count_from: int = count_from_option()
     no_cache: bool = cache_option()
     untested_code: int = untested_code_option()
+    format: Literal["text", "github", "markdown", "json"] = option(
+        "how the result is printed: github as annotations of GitHub Actions, markdown as a section"
+        " for a data-set card (default text)",
+        default="text",
+    )
+    fail_on: str | None = option(
+        "exit code 0 unless one of these is found: notice, warning, error, never, or codes as"
+        " TOUCH-103 and TOUCH-12 (all that begin so), divided by commas; what was not tested or"
+        " read fails in any case",
+        "WHAT",
+    )
 
     def run(self) -> int:
         """Check a data set; the exit code says how bad it is."""
-        from adaptfault.inspection.severity import worst
-        from diagnostics.decision.numbering import Numbering
+        from adaptfault.inspection.check_log import check_log
+        from adaptfault.inspection.findings import FailOn
 
+        fails = None if self.fail_on is None else FailOn.parse(self.fail_on)
         if self.write_valid:
             from adaptfault.data.recordings.valid import refuse_foreign
 
@@ -67,17 +77,40 @@ class Check(Inspecting):
         inspected = inspect_log(self, part)
         log = inspected.log
         report_range(log)
-        inspection = inspected.inspection
-        checked = _checked(self, log, inspection)
-        reasons = inspected.reasons(self.untested_code)
-        code = max(worst(reasons), 1 if checked.harms else 0)
-        notes = [reason.text for reason in reasons if reason.text] + list(checked.remarks)
+        judged = inspected.judged(self.untested_code)
+        checked = check_log(
+            log,
+            replace(inspected.inspection, findings=judged),
+            left_out=self.left_out,
+            compared=bool(self.reference or self.healthy),
+            source=", ".join(self.recordings),
+        )
+        code = checked.severity if fails is None else checked.findings.failed(fails)
+        notes = [one.text for one in inspected.reasons(self.untested_code) if one.text]
+        notes += checked.remarks
         _write(self, log, checked, code, notes)
-        numbering = Numbering.from_layout(log.layout, self.count_from)
-        summary = numbering.text(str(checked.summary))
-        text = text_of(inspection.diagnosis, notes, self.count_from)
-        self.emit(checked.to_dict(), f"{summary}\n\n{text}")
+        self._tell(checked, notes)
         return code
+
+    def _tell(self, checked: DataSetCheck, notes: list[str]) -> None:
+        """Print the result in the form that was asked for."""
+        from adaptfault.inspection.findings import with_codes
+        from diagnostics.decision.numbering import Numbering
+
+        findings = checked.findings
+        numbering = Numbering.from_layout(checked.layout, self.count_from)
+        if self.format == "github":
+            text = findings.github(numbering)
+        elif self.format == "markdown":
+            text = findings.markdown(numbering)
+        else:
+            told = text_of(checked.inspection.diagnosis, notes, self.count_from)
+            told = with_codes(told, findings, numbering.text)
+            left = [f"not checked: {numbering.text(one.what)}" for one in findings.unchecked]
+            summary = numbering.text(str(checked.summary))
+            text = "\n".join([f"{summary}\n\n{told}", *left, findings.summary()])
+        self.json |= self.format == "json"
+        self.emit(checked.to_dict(), text)
 
 
 add = Check.add
@@ -98,21 +131,6 @@ def _part(text: str, log: Opened) -> Recordings:
         )
     frames = tuple(islice(iter(log), begin, end))
     return Recordings(frames, log.layout, names=log.names[begin:end])
-
-
-def _checked(args: Check, log: Opened, inspection: Inspection) -> DataSetCheck:
-    from adaptfault.inspection.data_set import DataSetCheck, starts_and_tares
-    from diagnostics.preprocessing.readings import RecordingBlocks
-    from diagnostics.sensor.shared import measured
-
-    summary = summary_of(log)
-
-    def recordings() -> Iterator[NDArray[Any]]:
-        for frames in log:
-            yield from measured(RecordingBlocks([frames]), log.layout)
-
-    begun, tared = starts_and_tares(recordings, log.names, log.layout)
-    return DataSetCheck(inspection, summary, log.clock, getattr(args, "left_out", 0), begun, tared)
 
 
 def _write(args: Check, log: Opened, checked: DataSetCheck, code: int, notes: list[str]) -> None:

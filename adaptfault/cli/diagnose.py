@@ -45,8 +45,6 @@ class Diagnose(Inspecting):
 
     def run(self) -> int:
         """Diagnose; the exit code says who has to act, as that of maintain."""
-        from dataclasses import asdict
-
         from adaptfault.inspection.severity import worst
 
         inspected = inspect_log(self)
@@ -60,7 +58,7 @@ class Diagnose(Inspecting):
         found = {
             **diagnosis.to_dict(),
             **inspection.told,
-            "findings": [asdict(finding) for finding in inspection.findings],
+            "findings": [finding.to_dict() for finding in inspection.findings],
         }
         self.emit(found, text_of(diagnosis, notes, self.count_from))
         return code

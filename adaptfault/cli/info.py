@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from adaptfault.cli.command import option
 from adaptfault.cli.paths import Written
-from adaptfault.cli.reading import Reading, report_range, summary_of
+from adaptfault.cli.reading import Reading, report_range
 
 
 class Info(Reading):
@@ -22,6 +22,8 @@ class Info(Reading):
 
     def run(self) -> int:
         """Print the summary."""
+        from adaptfault.data.summary import summary_of
+
         opened = self.open(self.recordings)
         summary = summary_of(opened, opened.inferred)
         report_range(opened)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Protocol
 
 from adaptfault.cli.fitting import fit_diagnoser, fitting_bar
@@ -39,8 +39,16 @@ class InspectedLog:
     def reasons(self, untested_code: int) -> list[Reason]:
         """Return why somebody has to act; ``untested_code``: severity of a log that tests
         nothing."""
-        diagnosis = self.inspection.diagnosis
-        return _reasons(diagnosis, self.inspection.findings, self.bundle, untested_code)
+        return _reasons(self.inspection.diagnosis, self.judged(untested_code), self.bundle)
+
+    def judged(self, untested_code: int) -> tuple[Finding, ...]:
+        """Return the findings, each as bad as the bundle and ``untested_code`` leave it."""
+        of_faults, _ = _faults(self.inspection.diagnosis, self.bundle)
+        severities = {"fault": of_faults, "wire": of_faults, "untested": untested_code}
+        return tuple(
+            replace(one, severity=severities.get(one.name, one.severity))
+            for one in self.inspection.findings
+        )
 
 
 class Inspecting(Trusting, Reading):
@@ -112,6 +120,7 @@ def _inspected(
     """Inspect a log, as the version of the bundle that runs reads it."""
     from adaptfault.data.recordings.check import check_scale
     from adaptfault.data.recordings.doubts import copies
+    from adaptfault.inspection.check_log import classes_of
     from adaptfault.inspection.long_log import inspect_parts
     from diagnostics import SelfDiagnosis
 
@@ -134,16 +143,9 @@ def _inspected(
             cold,
             reference=healthy,
             n_recordings=len(log),
-            classes=_classes(log),
+            classes=classes_of(log),
             progress=advance,
         )
-
-
-def _classes(log: Opened) -> list[str] | None:
-    """Return the name of the class of each recording; None where they have none."""
-    if log.labels is None:
-        return None
-    return [log.class_names[label] if log.class_names else str(label) for label in log.labels]
 
 
 def _healthy(bundle: Bundle | None, recordings: Recordings | None) -> list[NDArray[Any]] | None:
@@ -171,7 +173,7 @@ def _bundle(args: Inspecting) -> Bundle | None:
 
 
 def _reasons(
-    diagnosis: Diagnosis, findings: Sequence[Finding], bundle: Bundle | None, untested_code: int
+    diagnosis: Diagnosis, findings: Sequence[Finding], bundle: Bundle | None
 ) -> list[Reason]:
     """Return why somebody has to act, in the order of the findings; without text what the diagnosis
     tells itself."""
@@ -183,11 +185,10 @@ def _reasons(
     for finding in findings:
         if finding.name in ("fault", "wire"):
             continue
-        severity = untested_code if finding.name == "untested" else finding.severity
         text = "" if finding.reason in told else finding.reason
         if finding.name in ("rewired", "replaced_pad"):
             text += "; the verdicts are those with the readings put back"
-        reasons.append(Reason(severity, text))
+        reasons.append(Reason(finding.severity, text))
     return reasons
 
 

@@ -13,7 +13,6 @@ from adaptfault.cli.paths import Read
 
 if TYPE_CHECKING:
     from adaptfault.data.recordings import Loaded, Opened, Recordings
-    from adaptfault.data.summary import Summary
     from diagnostics import SensorLayout
 
 _PLACES = ("key", "topic", "field", "columns", "ignore", "time_column", "label_column")
@@ -254,26 +253,6 @@ def perhaps_recordings() -> Any:
 def recordings_option() -> Any:
     """Return recordings as an option."""
     return option(_RECORDINGS, "FILE", describes=True, default=[])
-
-
-def summary_of(opened: Opened, inferred: Sequence[str] = ()) -> Summary:
-    """Return what recordings hold, ``inferred`` facts of the array included."""
-    from collections import Counter
-
-    from adaptfault.data.summary import summarise
-
-    classes = {}
-    if opened.labels is not None:
-        counts = Counter(opened.labels.tolist())
-        classes = {name: counts[i] for i, name in enumerate(opened.class_names)}
-    return summarise(
-        opened.pieces(),
-        opened.layout,
-        lengths=opened.lengths,
-        classes=classes,
-        inferred=tuple(inferred),
-        seconds=opened.seconds,
-    )
 
 
 def report_range(opened: Opened) -> None:

@@ -3,6 +3,7 @@ cells."""
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
@@ -16,6 +17,8 @@ from diagnostics.shown import shown
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+    from adaptfault.data.recordings import Opened, Recordings
 
 SCHEMA = "adaptfault.info/1"
 
@@ -220,6 +223,26 @@ def summarise(
         classes=dict(classes or {}),
         inferred=inferred,
         seconds=seconds,
+    )
+
+
+def summary_of(log: Opened | Recordings, inferred: Sequence[str] = ()) -> Summary:
+    """Return what recordings hold, ``inferred`` facts of the array included."""
+    from adaptfault.data.recordings import Recordings
+
+    classes = {}
+    if log.labels is not None:
+        counts = Counter(log.labels.tolist())
+        classes = {name: counts[i] for i, name in enumerate(log.class_names)}
+    if isinstance(log, Recordings):
+        return summarise(log.frames, log.layout, classes=classes, inferred=tuple(inferred))
+    return summarise(
+        log.pieces(),
+        log.layout,
+        lengths=log.lengths,
+        classes=classes,
+        inferred=tuple(inferred),
+        seconds=log.seconds,
     )
 
 

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -25,7 +26,10 @@ from numpy.typing import NDArray
 
 from adaptfault.data.recordings.facts.rates import Clock
 from adaptfault.data.summary import Summary
-from adaptfault.inspection.inspection import Inspection
+from adaptfault.inspection.codes import Need, unchecked
+from adaptfault.inspection.findings import Findings, Unchecked, unchecked_for_want
+from adaptfault.inspection.inspection import Finding, Inspection
+from adaptfault.inspection.severity import Name, of_finding
 from diagnostics import SensorLayout
 from diagnostics.preprocessing.levels import MAJORITY
 
@@ -37,6 +41,7 @@ _BELOW = 0.1  # of the median peak, on the other side of rest
 _RECORDINGS = 3  # that show what rest is
 _JITTER = 0.2  # of the period: times say less about lost frames from here on
 _LISTED = 5
+_FILES = "recordings or files could not be read: left out"
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,6 +54,8 @@ class DataSetCheck:
         clock: of its frames.
         left_out: recordings that could not be read.
         begin_in_contact, tared_in_contact: names of such recordings.
+        given: what the recordings were compared with.
+        source: what the data set is called.
     """
 
     inspection: Inspection
@@ -57,6 +64,8 @@ class DataSetCheck:
     left_out: int
     begin_in_contact: tuple[str, ...]
     tared_in_contact: tuple[str, ...]
+    given: frozenset[Need] = frozenset()
+    source: str = ""
 
     @property
     def healthy_share(self) -> float:
@@ -64,42 +73,69 @@ class DataSetCheck:
         diagnosis = self.inspection.diagnosis
         return 1 - len(diagnosis.fault_set) / int(diagnosis.layout.present.sum())
 
+    @cached_property
+    def findings(self) -> Findings:
+        """What was found, and what was not checked."""
+        told = (Finding(name, of_finding(name), text) for name, text in self._remarked)
+        found = (*self.inspection.findings, *told)
+        return Findings(found, self._unchecked, self.layout, self.source)
+
+    @property
+    def layout(self) -> SensorLayout:
+        """The array."""
+        return self.summary.layout
+
     @property
     def remarks(self) -> tuple[str, ...]:
-        """One sentence for each thing that whoever trains on the data should know."""
-        found = []
-        if self.left_out:
-            found.append(f"{self.left_out} recordings or files could not be read: left out")
-        if share := self._missing_share():
-            found.append(f"{share:.2%} of the readings are missing")
-        if self.clock.lost:
-            found.append(f"about {self.clock.lost} frames are missing between the times")
-        if self.clock.falls:
-            found.append(f"the clock falls back {self.clock.falls} times")
-        if self.clock.disorder:
-            found.append(self.clock.disorder)
-        if self.clock.jitter is not None and self.clock.jitter > _JITTER:
-            found.append(f"the period between frames varies by {self.clock.jitter:.0%}")
-        if self.begin_in_contact:
-            found.append(
-                f"{_counted(self.begin_in_contact)}: harmless, unless the driver tares at the start"
-            )
-        if self.tared_in_contact:
-            names = _listed(self.tared_in_contact)
-            found.append(f"readings fall below rest, as after a tare in contact: {names}")
-        return tuple(found)
+        """One sentence for each thing that whoever trains on the data should know, beside the state
+        of the cells."""
+        return tuple(text for _, text in self._remarked)
 
     @property
     def severity(self) -> int:
         """0 nothing to do, 1 there are remarks or single faults, 2 a wire or a tenth of the
         cells."""
-        return max(self.inspection.severity, 1 if self.harms else 0)
+        return self.findings.severity
+
+    @cached_property
+    def _remarked(self) -> list[tuple[Name, str]]:
+        found: list[tuple[Name, str]] = []
+        if self.left_out:
+            found.append(("unread", f"{self.left_out} {_FILES}"))
+        if share := self._missing_share():
+            found.append(("missing", f"{share:.2%} of the readings are missing"))
+        if self.clock.lost:
+            text = f"about {self.clock.lost} frames are missing between the times"
+            found.append(("time_gaps", text))
+        if self.clock.falls:
+            found.append(("clock_disorder", f"the clock falls back {self.clock.falls} times"))
+        if self.clock.disorder:
+            found.append(("clock_disorder", self.clock.disorder))
+        if self.clock.jitter is not None and self.clock.jitter > _JITTER:
+            text = f"the period between frames varies by {self.clock.jitter:.0%}"
+            found.append(("jitter", text))
+        if self.begin_in_contact:
+            begun = _counted(self.begin_in_contact)
+            text = f"{begun}: harmless, unless the driver tares at the start"
+            found.append(("begins_in_contact", text))
+        if self.tared_in_contact:
+            names = _listed(self.tared_in_contact)
+            text = f"readings fall below rest, as after a tare in contact: {names}"
+            found.append(("tared_in_contact", text))
+        return found
 
     @property
-    def harms(self) -> bool:
-        """Whether whoever trains loses something by what is remarked."""
-        harmless = 1 if self.begin_in_contact else 0
-        return len(self.remarks) > harmless
+    def _unchecked(self) -> tuple[Unchecked, ...]:
+        found = []
+        coverage = self.inspection.diagnosis.coverage
+        cells = int(self.layout.present.sum())
+        if len(coverage.untested):
+            places = [self.layout.place(cell) for cell in coverage.untested[:_LISTED].tolist()]
+            more = len(coverage.untested) - len(places)
+            listed = "; ".join([*places, *[f"and {more} more"] * bool(more)])
+            what = f"{len(coverage.untested)} of {cells} cells: no contact tested them ({listed})"
+            found.append(Unchecked(what, ("TOUCH-190",)))
+        return (*found, *unchecked_for_want(unchecked(set(self.given))))
 
     def _missing_share(self) -> float:
         present = self.summary.layout.present.ravel()
@@ -112,6 +148,8 @@ class DataSetCheck:
             "schema": SCHEMA,
             "severity": self.severity,
             "healthy_share": self.healthy_share,
+            "findings": self.findings.to_dicts(),
+            "not_checked": [one.to_dict() for one in self.findings.unchecked],
             "remarks": list(self.remarks),
             "clock": asdict(self.clock),
             "left_out": self.left_out,

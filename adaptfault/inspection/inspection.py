@@ -4,7 +4,7 @@ decides."""
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -15,10 +15,11 @@ from adaptfault.inspection.changed_readings import (
     find_changed_readings,
     find_sensor_change,
 )
+from adaptfault.inspection.codes import BY_NAME, Code
 from adaptfault.inspection.coincidence import coinciding
 from adaptfault.inspection.converter_range import within_range
 from adaptfault.inspection.severity import Name, of_faults, of_finding, untested, worst
-from diagnostics import Diagnosis, FaultSet, SelfDiagnosis, SensorLayout
+from diagnostics import Diagnosis, Fault, FaultSet, SelfDiagnosis, SensorLayout
 from diagnostics.diagnosis import checked_recordings
 from diagnostics.evidence.drift import GAIN
 from diagnostics.preprocessing.readings import RecordingBlocks
@@ -60,11 +61,27 @@ class Finding:
         name: one of :data:`adaptfault.inspection.severity.NAMES`.
         severity: 0 nothing to do, 1 watch, 2 a person is needed, 3 unknown.
         reason: one sentence.
+        fault: of which it tells; None: of none.
     """
 
     name: Name
     severity: int
     reason: str
+    fault: Fault | None = field(default=None, repr=False)
+
+    @property
+    def code(self) -> Code:
+        """What is to say of each finding of this kind."""
+        return BY_NAME[self.name if self.fault is None else str(self.fault.kind)]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return a JSON-safe dict."""
+        return {
+            "code": str(self.code),
+            "name": self.name,
+            "severity": self.severity,
+            "reason": self.reason,
+        }
 
 
 @shown
@@ -124,7 +141,7 @@ class Inspection:
         return {
             "schema": SCHEMA,
             "severity": self.severity,
-            "findings": [asdict(finding) for finding in self.findings],
+            "findings": [finding.to_dict() for finding in self.findings],
             **self.told,
             "diagnosis": self.diagnosis.to_dict(),
         }
@@ -345,7 +362,7 @@ def of_diagnosis(diagnosis: Diagnosis) -> list[Finding]:
     ]
     told = {one.reason for one in of_frames}
     findings = [
-        Finding("fault" if f.line is None else "wire", severity, f.reason)
+        Finding("fault" if f.line is None else "wire", severity, f.reason, f)
         for f in diagnosis.faults
         if f.reason not in told
     ]

@@ -41,6 +41,13 @@ Name = Literal[
     "swapped_in_part",
     "another_sensor",
     "coincides",
+    "unread",
+    "missing",
+    "time_gaps",
+    "clock_disorder",
+    "jitter",
+    "begins_in_contact",
+    "tared_in_contact",
 ]
 NAMES: tuple[str, ...] = get_args(Name)
 """Names of findings; they never change, because programs ask for them."""
@@ -64,6 +71,7 @@ _OF_FINDING: Mapping[Name, int] = {
     "normalised": 2,
     "silent_array": 2,
     "lost_frames": 0,
+    "begins_in_contact": 0,
     "repeated_frames": 0,
 }
 

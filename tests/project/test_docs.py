@@ -281,3 +281,10 @@ def test_the_script_draws_the_figures_of_the_method_pages(tmp_path):
     )
     committed = {path.name for path in (HOME / "docs" / "figures").glob("*.png")}
     assert {path.name for path in tmp_path.glob("*.png")} == committed
+
+
+def test_the_page_of_codes_is_written_from_their_registry(monkeypatch):
+    monkeypatch.syspath_prepend(HOME / "docs")
+    import codes_page
+
+    assert codes_page.PAGE.read_text() == codes_page.page()

@@ -83,7 +83,12 @@ def test_a_dead_cell_and_a_broken_row_are_findings_and_the_worst_decides(
     assert (names(wire), wire.severity) == ({"wire"}, 2)
     document = json.loads(json.dumps(wire.to_dict(), allow_nan=False))
     assert document["findings"] == [
-        {"name": "wire", "severity": 2, "reason": wire.diagnosis.faults[0].reason}
+        {
+            "code": "TOUCH-102",
+            "name": "wire",
+            "severity": 2,
+            "reason": wire.diagnosis.faults[0].reason,
+        }
     ]
 
 

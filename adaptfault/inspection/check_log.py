@@ -1,0 +1,63 @@
+"""The check of recordings that are open or in memory: what a command and a training script do."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+from numpy.typing import NDArray
+
+from adaptfault.data.recordings import Opened, Recordings
+from adaptfault.data.recordings.facts.rates import Clock
+from adaptfault.data.recordings.load import PART
+from adaptfault.data.summary import summary_of
+from adaptfault.inspection.codes import Need
+from adaptfault.inspection.data_set import DataSetCheck, starts_and_tares
+from adaptfault.inspection.inspection import Inspection
+from diagnostics.preprocessing.readings import RecordingBlocks
+from diagnostics.sensor.shared import measured
+
+
+def check_log(
+    log: Opened | Recordings,
+    inspection: Inspection,
+    *,
+    left_out: int = 0,
+    compared: bool = False,
+    source: str = "",
+) -> DataSetCheck:
+    """Return the health of a data set, from an inspection of it.
+
+    Args:
+        log: the data set.
+        inspection: of its recordings, with their classes.
+        left_out: recordings and files that could not be read.
+        compared: whether the inspection had healthy recordings to compare with.
+        source: what the data set is called.
+    """
+
+    def recordings() -> Iterator[NDArray[Any]]:
+        for frames in log:
+            yield from measured(RecordingBlocks([frames]), log.layout)
+
+    clock = log.clock if isinstance(log, Opened) else Clock()
+    summary = summary_of(log)
+    given: set[Need] = set()
+    if compared:
+        given.add("reference")
+    if clock.jitter is not None:
+        given.add("times")
+    in_memory = int(summary.lengths.sum()) * log.layout.n_cells <= PART
+    if log.labels is not None and in_memory:
+        given.add("classes")
+    begun, tared = starts_and_tares(recordings, log.names, log.layout)
+    return DataSetCheck(
+        inspection, summary, clock, left_out, begun, tared, frozenset(given), source
+    )
+
+
+def classes_of(log: Opened | Recordings) -> list[str] | None:
+    """Return the name of the class of each recording; None where they have none."""
+    if log.labels is None:
+        return None
+    return [log.class_names[label] if log.class_names else str(label) for label in log.labels]

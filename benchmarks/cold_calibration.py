@@ -43,7 +43,7 @@ def cells_at_rest(bench: Bench) -> np.ndarray:
             for frames in given:
                 stream.extend(frames)
             stream = stream.complete()
-            spatial = stream.spatial().finish()
+            spatial = stream.spatial()
             still = stream.present & stream.rests() & spatial.scored & ~stream.runs.moved
             cells = np.flatnonzero(still & (spatial.surprisal > 0))
             found.append(

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Generator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -38,7 +38,6 @@ from diagnostics.evidence.life import PIECE, Life
 from diagnostics.evidence.life.pulled_lines import pulled_lines
 from diagnostics.evidence.reference import Reference, highest_reading, living, tolerance_of
 from diagnostics.evidence.spatial import Exclusion, Spatial
-from diagnostics.evidence.stepping import finished
 from diagnostics.evidence.stream_state import StreamState
 from diagnostics.faults import Fault, FaultKind
 from diagnostics.healthy.reference_faults import find_reference_faults, never_moved
@@ -82,7 +81,6 @@ _ENGINES = ("events", "model")
 _WHOLE = 1e-6  # by which a whole number may be missed after a conversion to loads and back
 _CERTAIN = 1 - RARE
 
-Result = TypeVar("Result", covariant=True)
 LogRatio = Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64]]
 
 
@@ -543,52 +541,47 @@ class SelfDiagnosis:
         order = self._order if self.layout.axes > 1 else None
         return StreamState(self._planes, reference, exclusion, needed, self.load_, order)
 
-    def evaluate(self, stream: StreamState, *, n_recordings: int = 1) -> Diagnosis:
-        """Return the diagnosis of the log behind ``stream``.
-
-        Raises:
-            ValueError: no frame with a reading was received yet; ``engine="model"``.
-        """
-        with one_thread():
-            return finished(self.steps(stream, n_recordings=n_recordings))
-
-    def steps(
+    def evaluate(
         self, stream: StreamState, *, n_recordings: int = 1, life: Life | None = None
-    ) -> Generator[None, None, Diagnosis]:
-        """Yield between steps of a few milliseconds of :meth:`evaluate`, for a control loop; return
-        the diagnosis.
+    ) -> Diagnosis:
+        """Return the diagnosis of the log behind ``stream``.
 
         Args:
             stream: the state of the log.
             n_recordings: of which it consists.
             life: the last result of :meth:`proof`, which is then not repeated, nor are the lines
                 of a shorted crossing tested; None: they are.
+
+        Raises:
+            ValueError: no frame with a reading was received yet; ``engine="model"``.
         """
+        with one_thread():
+            return self._evaluated(stream, n_recordings, life)
+
+    def _evaluated(self, stream: StreamState, n_recordings: int, life: Life | None) -> Diagnosis:
+        """Return the diagnosis; arguments as in :meth:`evaluate`."""
         if self._model is not None:
             raise ValueError(f"{_WHOLE_LOGS}; got a stream: use diagnose, or engine='events'")
         stream = stream.complete()
         if not stream.received.any():
             raise ValueError("the recordings hold no frame with a reading: nothing to diagnose")
         aliases, copies = find_aliasing(stream)
-        yield
         explained = copies
         still = list[StaticLoad]()
         tests_lines = life is None
         if life is None:
-            life = yield from self._proof(stream, copies)
+            life = self._proof(stream, copies)
         log_ratio = self._log_ratio(stream, life)
-        spatial, found = yield from self._tested(stream, explained, log_ratio, life)
+        spatial, found = self._tested(stream, explained, log_ratio, life)
         for beside in (False, True):
             while True:
-                yield
                 faulty = found.probability >= DOUBTED if beside else found.faulty
                 loads = find_static_loads(stream, spatial, faulty, copies, still, beside=beside)
                 others = copies.copy()
                 others[[cell for load in loads for cell in load.cells]] = True
                 if (others == explained).all():
                     break
-                yield
-                tested = yield from self._tested(stream, others, log_ratio, life)
+                tested = self._tested(stream, others, log_ratio, life)
                 if tested[1].probability.sum() >= found.probability.sum():  # it explains nothing
                     break
                 still, explained, (spatial, found) = loads, others, tested
@@ -601,12 +594,10 @@ class SelfDiagnosis:
             return alone + np.maximum(log_ratio(surprisal, surprisal) - alone, 0.0) / 2
 
         groups = self._groups(found, stream, together(spatial.initial), explained)
-        yield
         for group, surprisal in zip(
             groups, stream.each_excluded(spatial, explained, groups), strict=True
         ):
             weight[group] = np.maximum(weight[group], together(surprisal)[group])
-            yield
         found = replace(found, weight=weight).of(self._place)
         causes, possible = root_causes(found, aliases, self.layout)
         unused = self._unused(stream, found.alive, causes, contradicted=life.contradicting > 0)
@@ -622,7 +613,7 @@ class SelfDiagnosis:
         # each other; nor is a line that a shorted crossing pulls.
         pulled = np.zeros_like(inferred)
         if tests_lines:
-            pulled = yield from self._pulled(stream, life, causes, inferred)
+            pulled = self._pulled(stream, life, causes, inferred)
             causes = pulling(causes, pulled[self._place], self.layout)
         shown = (life.shown | (stream.reference.dead > 0)) & ~pulled
         if stream.crosstalk is not None:
@@ -657,33 +648,27 @@ class SelfDiagnosis:
             contradicting=life.contradicting,
         )
 
-    def proof(self, stream: StreamState) -> Generator[None, None, Life]:
-        """Yield between steps of a few milliseconds; return whether cells depend on each other as
-        healthy ones do."""
+    def proof(self, stream: StreamState) -> Life:
+        """Return whether cells depend on each other as healthy ones do."""
         stream = stream.complete()
-        _, copies = find_aliasing(stream)
-        yield
-        life = yield from self._proof(stream, copies)
-        return life
+        with one_thread():
+            _, copies = find_aliasing(stream)
+            return self._proof(stream, copies)
 
-    def _proof(
-        self, stream: StreamState, explained: NDArray[np.bool_]
-    ) -> Generator[None, None, Life]:
-        """Yield between steps; return whether cells depend on each other; ``explained`` ones (bool
-        ``[D]``) are out."""
+    def _proof(self, stream: StreamState, explained: NDArray[np.bool_]) -> Life:
+        """Return whether cells depend on each other; ``explained`` ones (bool ``[D]``) are out."""
         if stream.reference.life is None or stream.noisier:
             return Life.assumed(stream.layout.n_cells)
         evidence = stream.evidence_of_life()
-        yield
         # Cells that move by themselves mislead the spatial test; those that never moved say nothing
         # yet.
         first = stream.proof_of_life(evidence, explained, ~stream.runs.moved)
-        life = yield from first.steps()
+        life = first.finish()
         log_ratio = self._log_ratio(stream, life)
-        spatial, found = yield from self._tested(stream, explained, log_ratio, life)
+        spatial, found = self._tested(stream, explained, log_ratio, life)
         # Cells that the spatial test suspects predict no others.
         suspected = spatial.scored & (found.faulty | stream.suspected(spatial))
-        life = yield from stream.proof_of_life(evidence, explained, suspected, first).steps()
+        life = stream.proof_of_life(evidence, explained, suspected, first).finish()
         return life if stream.crosstalk is None else life.undecided()
 
     def _unused(
@@ -712,9 +697,9 @@ class SelfDiagnosis:
         life: Life,
         causes: Sequence[Fault],
         faulty: NDArray[np.bool_],
-    ) -> Generator[None, None, NDArray[np.bool_]]:
-        """Yield between steps; return the cells on lines that a shorted crossing pulls, bool
-        ``[D]``; ``faulty`` ones (bool ``[D]``), those of the ``causes``, tell nothing of a line."""
+    ) -> NDArray[np.bool_]:
+        """Return the cells on lines that a shorted crossing pulls, bool ``[D]``; ``faulty`` ones
+        (bool ``[D]``), those of the ``causes``, tell nothing of a line."""
         shorts = [f.cells[0] for f in causes if f.kind is FaultKind.SHORT and f.line is None]
         evidence = None
         if shorts and stream.reference.life is not None and not stream.noisier:
@@ -723,7 +708,7 @@ class SelfDiagnosis:
             return np.zeros(self.layout.n_cells, bool)
         known = stream.received & ~stream.silent & ~life.refuted & ~faulty[self._order]
         shorted = self._place[np.asarray(shorts)]
-        return (yield from pulled_lines(evidence.log, shorted, known))
+        return pulled_lines(evidence.log, shorted, known)
 
     @staticmethod
     def _misleading(stream: StreamState, life: Life) -> NDArray[np.bool_]:
@@ -735,14 +720,12 @@ class SelfDiagnosis:
 
     def _tested(
         self, stream: StreamState, explained: NDArray[np.bool_], log_ratio: LogRatio, life: Life
-    ) -> Generator[None, None, tuple[Spatial, CellFindings]]:
-        """Yield between steps of the spatial test without ``explained`` cells (bool ``[D]``);
-        return its findings.
+    ) -> tuple[Spatial, CellFindings]:
+        """Return the findings of the spatial test without ``explained`` cells (bool ``[D]``).
 
         Moving cells that are refuted predict no others.
         """
-        spatial = yield from _stepped(stream.spatial(explained, self._misleading(stream, life)))
-        yield
+        spatial = stream.spatial(explained, self._misleading(stream, life))
         return spatial, self._found(stream, spatial, explained, log_ratio, life)
 
     def _falls(self, stream: StreamState) -> bool | None:
@@ -1083,21 +1066,6 @@ def _with_causes(
         found[cells] = np.maximum(found[cells], fault.probability or 0.0)
         blamed[cells] = True
     return found, blamed
-
-
-class _Steps(Protocol[Result]):
-    """A test that takes a few milliseconds a step."""
-
-    def step(self) -> bool: ...
-    def finish(self) -> Result: ...
-
-
-def _stepped(test: _Steps[Result]) -> Generator[None, None, Result]:
-    """Yield between the steps of a test; return its result."""
-    yield
-    while not test.step():
-        yield
-    return test.finish()
 
 
 def axis_planes(layout: SensorLayout) -> tuple[SensorLayout, NDArray[np.intp]]:

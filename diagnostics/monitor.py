@@ -3,39 +3,48 @@ batch diagnosis."""
 
 from __future__ import annotations
 
-from collections.abc import Generator
+from concurrent.futures import Future
 from copy import copy
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import partial
+from math import ceil
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from diagnostics.evidence.life import Life
-from diagnostics.evidence.stepping import finished
 from diagnostics.preprocessing.array_likes import plain_array
-from diagnostics.threads import one_thread
+from diagnostics.preprocessing.readings import SEGMENT
+from diagnostics.threads import Worker, one_thread
 from diagnostics.wiring import Line
 
 if TYPE_CHECKING:
     from diagnostics.decision.result import Diagnosis
     from diagnostics.diagnosis import SelfDiagnosis
+    from diagnostics.evidence.stream_state import StreamState
     from diagnostics.faults import Fault
 
 Key = tuple[Line | None, int]
+Frames = list[tuple[int, NDArray[np.float64]]]  # lost before it, frame [D]
 
-_PROVEN_EVERY = 4  # segments, life is proven: a size
+_PROVEN_EVERY = 4  # evaluations: a size
+_A_CELL = 1e-3  # seconds that an evaluation with a proof of life takes, on a busy machine
 _LONGEST_GAP = 86400.0  # seconds; after a longer one the clock was set
 
 
 class Monitor:
     """Monitors a running sensor and reports faults that are new, have changed, or are gone.
 
-    After each segment of 32 frames the diagnosis is updated, in small steps over the frames that
-    follow. While a wire breaks, healthy cells beside it look faulty for an evaluation, so a change
-    is reported once the next evaluation confirms it, at most about 80 frames after it becomes
-    detectable. The proof of life of all cells takes the frames in between, so that a dead cell that
-    moves is reported up to some 200 frames later. :meth:`diagnosis` evaluates at once.
+    After each segment of 32 frames a thread of the monitor's own evaluates them, and the 16th frame
+    after it tells what changed. Which frame tells which fault does not depend on the speed of the
+    machine: where the evaluation is not complete by then, that frame waits for it. A large array is
+    given more frames: those of 1 ms a cell, at its rate.
+
+    While a wire breaks, healthy cells beside it look faulty for an evaluation, so a change is
+    reported once the next evaluation confirms it, at most about 80 frames after it becomes
+    detectable. Every fourth evaluation proves the life of all cells, so that a dead cell that moves
+    is reported up to some 200 frames later. :meth:`diagnosis` evaluates at once.
 
     Args:
         fitted: a fitted :class:`SelfDiagnosis`; an unfitted one is a cold start.
@@ -50,24 +59,27 @@ class Monitor:
         import scipy.ndimage  # imported here, not in the control loop
         import scipy.optimize  # noqa: F401
 
-        with one_thread():  # looks for the libraries once
-            pass
         self._diagnoser = fitted
-        self._stream = fitted.stream()
-        self._work: Generator[None, None, Diagnosis] | None = None
-        self._proof: Generator[None, None, Life] | None = None
-        proves = self._stream.reference.life is not None
-        self._life = Life.unknown(fitted.layout.n_cells) if proves else None
-        self._segments = 0  # since the last proof of life began
+        stream = fitted.stream()
+        proves = stream.reference.life is not None
+        life = Life.unknown(fitted.layout.n_cells) if proves else None
+        self._record = _Record(stream, life)
+        self._work: Future[_Record] | _Record | None = None  # with those given
+        self._given: Frames = []
+        self._new: Frames = []
+        takes = fitted.layout.n_cells * _A_CELL * fitted.layout.rate
+        self._told_after = max(SEGMENT // 2, ceil(takes))  # frames
+        self._every = SEGMENT * ceil(self._told_after / SEGMENT)
+        self._worker = Worker()
         self._known: dict[Key, Fault] = {}
         self._evaluated: Diagnosis | None = None
         self._settled: Diagnosis | None = None
         self._time: float | None = None
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return what a copy or a pickle holds; an evaluation under way begins anew after the
-        copy's next segment."""
-        return {**vars(self), "_work": None, "_proof": None}
+        """Return what a copy or a pickle holds; it waits for an evaluation under way."""
+        work = None if self._work is None else _result(self._work)
+        return {**vars(self), "_new": list(self._new), "_work": work, "_worker": Worker()}
 
     def update(self, frame: ArrayLike, time: float | None = None) -> tuple[Fault, ...]:
         """Process one frame; return the faults that are new, changed, or gone.
@@ -84,52 +96,57 @@ class Monitor:
         Raises:
             ValueError: a frame of another shape, or a time that is not finite; the frame is not
                 processed.
+            Exception: what an evaluation raised; the frames that it took in count as lost.
         """
         layout = self._diagnoser.layout
-        reading = np.asarray(plain_array(frame), dtype=np.float64).reshape(-1)
+        reading = np.array(plain_array(frame), dtype=np.float64).reshape(-1)
         if reading.size != layout.n_cells:
             raise ValueError(
                 f"expected a frame of {layout.n_cells} readings ({layout}), got {reading.size}"
             )
+        lost = 0
         if time is not None:
             if not np.isfinite(time):
                 raise ValueError(f"time {time}: expected seconds, or None where it is unknown")
             if self._time is not None and 0 < time - self._time <= _LONGEST_GAP:
-                self._stream.miss(round((time - self._time) * layout.rate) - 1)
+                lost = max(round((time - self._time) * layout.rate) - 1, 0)
             self._time = time
-        due = self._stream.due
-        with one_thread():
-            if self._stream.extend(reading[None]):
-                self._begin()
-            elif not due:
-                return self._step()
-        return ()
+        self._new.append((lost, reading))
+        changes: tuple[Fault, ...] = ()
+        if self._work is not None and len(self._new) >= self._told_after:
+            changes = self._collect(self._work)
+        if len(self._new) >= self._every:
+            self._begin()
+        return changes
 
     def _begin(self) -> None:
-        """Begin to evaluate the frames so far, unless an evaluation is under way."""
-        if self._work is None:
-            self._work = self._diagnoser.steps(copy(self._stream), life=self._life)
-        self._segments += 1
-        if self._proof is None and self._life is not None and self._segments >= _PROVEN_EVERY:
-            self._proof = self._diagnoser.proof(copy(self._stream))
-            self._segments = 0
+        """Begin to evaluate the new frames."""
+        self._given = self._new
+        self._new = []
+        self._work = self._worker.begin(
+            partial(_evaluated, self._diagnoser, self._record, self._given)
+        )
 
-    def _step(self) -> tuple[Fault, ...]:
-        """Do a step of the evaluation, or else of the proof of life; return the changes when it is
-        complete."""
-        if self._work is not None:
-            try:
-                next(self._work)
-            except StopIteration as end:
-                self._work = None
-                return self._changes(end.value)
-        elif self._proof is not None:
-            try:
-                next(self._proof)
-            except StopIteration as end:
-                self._proof = None
-                self._life = end.value
-        return ()
+    def _collect(self, work: Future[_Record] | _Record) -> tuple[Fault, ...]:
+        """Wait for the evaluation under way, and return its changes."""
+        try:
+            self._record = _result(work)
+        except Exception:
+            stream = copy(self._record.stream)
+            stream.miss(sum(lost + 1 for lost, _ in self._given))
+            self._record = replace(self._record, stream=stream, diagnosis=None)
+            self._work = None
+            raise
+        self._work = None
+        diagnosis = self._record.diagnosis
+        return () if diagnosis is None else self._changes(diagnosis)
+
+    def _so_far(self) -> _Record:
+        """Return the record with all frames so far."""
+        record = self._record if self._work is None else _result(self._work)
+        stream = copy(record.stream)
+        _extend(stream, self._new)
+        return replace(record, stream=stream)
 
     def flush(self) -> tuple[Fault, ...]:
         """Evaluate all frames so far at once; return the faults that are new, changed, or gone.
@@ -137,16 +154,15 @@ class Monitor:
         After it, what was told is what :meth:`diagnosis` tells. It takes as long as that one, some
         hundred milliseconds: it belongs to the end of a log, or to a pause of the control loop.
         """
-        if not self._stream.received.any():
+        record = self._so_far()
+        if not record.stream.complete().received.any():
             return ()
+        record = _concluded(self._diagnoser, record)
+        self._record = record
         self._work = None
-        self._proof = None
-        self._segments = 0
-        with one_thread():
-            if self._life is not None:
-                self._life = finished(self._diagnoser.proof(copy(self._stream)))
-            steps = self._diagnoser.steps(copy(self._stream), life=self._life)
-            return self._changes(finished(steps), final=True)
+        self._new = []
+        assert record.diagnosis is not None
+        return self._changes(record.diagnosis, final=True)
 
     def diagnosis(self) -> Diagnosis:
         """Return the diagnosis of all frames so far, as :meth:`SelfDiagnosis.diagnose` does.
@@ -154,7 +170,7 @@ class Monitor:
         Raises:
             ValueError: no frame with a reading was received yet.
         """
-        return self._diagnoser.evaluate(self._stream)
+        return self._diagnoser.evaluate(self._so_far().stream)
 
     @property
     def faults(self) -> tuple[Fault, ...]:
@@ -212,3 +228,62 @@ def _is_in(fault: Fault, diagnosis: Diagnosis) -> bool:
     if fault.line is not None and any(other.line == fault.line for other in diagnosis.faults):
         return True
     return diagnosis.fault_set.mask[list(fault.cells)].all().item()
+
+
+@dataclass(frozen=True)
+class _Record:
+    """What the frames leave.
+
+    Attributes:
+        stream: the state after them; it does not change any more.
+        life: what the last proof of life says; None: the reference has no model of it.
+        evaluations: since that proof.
+        diagnosis: None: the last frames completed no segment, and were not evaluated.
+    """
+
+    stream: StreamState
+    life: Life | None
+    evaluations: int = 0
+    diagnosis: Diagnosis | None = None
+
+
+def _result(work: Future[_Record] | _Record) -> _Record:
+    """Wait for an evaluation."""
+    return work if isinstance(work, _Record) else work.result()
+
+
+def _extend(stream: StreamState, given: Frames) -> bool:
+    """Take in frames; return whether a segment was completed."""
+    frames = np.array([frame for _, frame in given])
+    lost = np.array([before for before, _ in given], np.intp)
+    gaps = np.flatnonzero(lost)
+    completed = False
+    with one_thread():
+        for before, part in zip((0, *lost[gaps].tolist()), np.split(frames, gaps), strict=True):
+            stream.miss(before)
+            if len(part):
+                completed |= stream.extend(part)
+    return completed
+
+
+def _evaluated(diagnoser: SelfDiagnosis, record: _Record, given: Frames) -> _Record:
+    """Return the record after more frames."""
+    stream = copy(record.stream)
+    completed = _extend(stream, given)
+    record = replace(record, stream=stream, diagnosis=None)
+    if not completed or not stream.received.any():
+        return record
+    evaluations = record.evaluations + 1
+    if evaluations >= _PROVEN_EVERY:
+        return _concluded(diagnoser, record)
+    diagnosis = diagnoser.evaluate(stream, life=record.life)
+    return replace(record, evaluations=evaluations, diagnosis=diagnosis)
+
+
+def _concluded(diagnoser: SelfDiagnosis, record: _Record) -> _Record:
+    """Return the record with a proof of life and the diagnosis that it leads to."""
+    life = record.life
+    if life is not None:
+        life = diagnoser.proof(record.stream)
+    diagnosis = diagnoser.evaluate(record.stream, life=life)
+    return replace(record, life=life, evaluations=0, diagnosis=diagnosis)

@@ -319,7 +319,7 @@ def _trial(
     stream = StreamState(layout, reference, exclusion)
     stream.extend(inject(log, faults, layout))
     stream = stream.complete()
-    spatial = stream.spatial().finish()
+    spatial = stream.spatial()
     broken = np.zeros(layout.n_cells, bool)
     broken[[c for fault in faults for c in fault.cells]] = True
     scored = spatial.scored

@@ -110,8 +110,7 @@ class Spatial:
 
 
 class SpatialTest:
-    """The iterated test; each :meth:`step` is one round, so that a control loop can spread it over
-    frames.
+    """The iterated test.
 
     Args:
         events: the contact events, in time order.
@@ -121,7 +120,7 @@ class SpatialTest:
         misleading: bool ``[D]``, cells that are tested and predict no others; None: none.
 
     Attributes:
-        result: None before the last step.
+        result: None before it is found.
     """
 
     def __init__(
@@ -150,20 +149,14 @@ class SpatialTest:
         self._agreed: tuple[Prediction, Floats] | None = None  # score with the final predictors
         self._rounds = self._exclusions = 0
 
-    def step(self) -> bool:
-        """Score all cells once and update the predictors, or look for drift. Return whether there
-        is a result."""
-        if self.result is None:
+    def finish(self) -> Spatial:
+        """Return the result: all cells are scored and the predictors updated until they agree, then
+        drift is looked for."""
+        while self.result is None:
             if self._agreed is None:
                 self._update()
             else:
                 self._look_for_drift(*self._agreed)
-        return self.result is not None
-
-    def finish(self) -> Spatial:
-        """Do all steps that are left, and return the result."""
-        while self.result is None:
-            self.step()
         return self.result
 
     def _update(self) -> None:

@@ -65,10 +65,9 @@ KEPT_EVENTS = 32
 # consecutive frames without a reading: not chance any more
 _SILENT = 2 * SEGMENT
 _NEVER_RECEIVED = SEGMENT // 2
-# frames of a segment after which old events are scored, a part with each frame
-_PAUSE = SEGMENT // 2
+# a shorter segment, as the last one of a log, leaves old events for the next one
+_FEW = SEGMENT // 2
 _CLEAR = 4.0  # times the tolerance of two equal lines: lighter loads are equal by chance
-_STEPS = 8  # in which one pass over all tiles is split: a monitor does one step a frame
 
 Mask = NDArray[np.bool_]
 Cells = NDArray[np.intp]
@@ -148,8 +147,6 @@ class StreamState:
         self._buffer = np.empty((SEGMENT, layout.n_cells))
         self._numbers = np.empty(SEGMENT, np.intp)
         self._filled = 0
-        # the test of old events, and the events to keep
-        self._dropping: tuple[Test, TiledEvents] | None = None
         self._models: dict[int, Model] = {}
 
     @property
@@ -175,13 +172,8 @@ class StreamState:
         self.transport, new = self.transport.receive(frames, self.present, self._patience)
         completed = False
         taken = 0
-        if self._dropping is not None and self._dropping[0].step():
-            self._drop()
         while taken < len(new):
-            if self._filled == _PAUSE and self._crowded and self._dropping is None:
-                old, kept = self.local.split(MAX_EVENTS, KEPT_EVENTS)
-                self._dropping = self._test(self.cells(None), old, passes=1), kept
-            n = min((_PAUSE if self._filled < _PAUSE else SEGMENT) - self._filled, len(new) - taken)
+            n = min(SEGMENT - self._filled, len(new) - taken)
             chosen = new[taken : taken + n]
             self._buffer[self._filled : self._filled + n] = frames[chosen]
             self._numbers[self._filled : self._filled + n] = chosen + before
@@ -191,11 +183,6 @@ class StreamState:
                 self._close()
                 completed = True
         return completed
-
-    @property
-    def due(self) -> bool:
-        """Whether the next frame takes more work than storing it."""
-        return self._filled == SEGMENT - 1 or (self._filled >= _PAUSE and self._crowded)
 
     def miss(self, frames: int) -> None:
         """Count frames that were never received, according to the sender's clock."""
@@ -207,9 +194,16 @@ class StreamState:
         stays as it is."""
         if not self._filled:
             return self
-        self._drop()
         other = copy(self)
-        other._close()  # reads the buffered frames and changes none of them
+        other._close()
+        return other
+
+    def __copy__(self) -> StreamState:
+        """Return a state that takes in frames of its own."""
+        other = object.__new__(type(self))
+        vars(other).update(vars(self))
+        other._buffer = self._buffer.copy()
+        other._numbers = self._numbers.copy()
         return other
 
     def reading(self, load: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -373,7 +367,7 @@ class StreamState:
         eligible = self.received & ~self.silent & ~explained & (self.reference.dead == 0)
         return LifeTest(evidence, eligible, constant, first)
 
-    def spatial(self, explained: Mask | None = None, misleading: Mask | None = None) -> Test:
+    def spatial(self, explained: Mask | None = None, misleading: Mask | None = None) -> Spatial:
         """Return the spatial test of all constant cells.
 
         Cells already ``explained`` (bool ``[D]``) are left out; those that are ``misleading``
@@ -508,14 +502,18 @@ class StreamState:
 
     def _test(
         self, cells: CellState, events: TiledEvents, passes: int, misleading: Mask | None = None
-    ) -> Test:
-        if self.tiled:
-            none = np.zeros(self.layout.n_cells, bool)
-            return _TiledTest(
-                self, cells, events, passes, none if misleading is None else misleading
-            )
-        (only,) = events.of
-        return SpatialTest(only.kept, cells, self.model_of(0, only), self.exclusion, misleading)
+    ) -> Spatial:
+        """Return the spatial test; of several tiles in one or two ``passes``, see the module."""
+        if not self.tiled:
+            (only,) = events.of
+            model = self.model_of(0, only)
+            return SpatialTest(only.kept, cells, model, self.exclusion, misleading).finish()
+        if misleading is None:
+            misleading = np.zeros(self.layout.n_cells, bool)
+        result = _scored(self, cells, events, misleading, self.runs.moved)
+        for _ in range(passes - 1):
+            result = _scored(self, cells, events, misleading, ~self.suspected(result))
+        return result
 
     def _with_held_loads(self, cells: CellState) -> CellState:
         """Return the cells with the evidence of loads that are held where nothing has moved for
@@ -540,7 +538,8 @@ class StreamState:
 
     def _close(self) -> None:
         """Process a segment."""
-        self._drop()
+        if self._filled > _FEW and any(len(events.kept) > MAX_EVENTS for events in self.local.of):
+            self._drop()
         frames = self._buffer[: self._filled]
         numbers = self._numbers[: self._filled]
         self._filled = 0
@@ -605,83 +604,30 @@ class StreamState:
         telling = informative(frames, still, clear) & self.touched
         self.duplicates = self.duplicates.extend(frames, numbers, telling, plain.near)
 
-    @property
-    def _crowded(self) -> bool:
-        return any(len(events.kept) > MAX_EVENTS for events in self.local.of)
-
     def _drop(self) -> None:
-        """Finish the test of old events, and drop them."""
-        if self._dropping is not None:
-            test, kept = self._dropping
-            self.accumulated = test.finish().surprisal
-            self.local = kept
-            self._dropping = None
+        """Score old events, and drop them."""
+        old, kept = self.local.split(MAX_EVENTS, KEPT_EVENTS)
+        self.accumulated = self._test(self.cells(None), old, passes=1).surprisal
+        self.local = kept
 
 
-class _TiledTest:
-    """The spatial test of several tiles, in one or two passes, see the module."""
-
-    def __init__(
-        self,
-        stream: StreamState,
-        cells: CellState,
-        events: TiledEvents,
-        passes: int,
-        misleading: Mask,
-    ) -> None:
-        self._stream = stream
-        self._cells = cells
-        self._events = events
-        self._passes = passes
-        self._misleading = misleading
-        self._outside = stream.runs.moved  # predictors of each tile outside its outputs
-        self._begin()
-
-    def _begin(self) -> None:
-        self._result = Spatial(
-            *(np.array(values) for values in vars(Spatial.before(self._cells)).values())
-        )
-        self._queue = list(self._events.kept())
-        self._each = max(1, -(-len(self._queue) // _STEPS))
-
-    def step(self) -> bool:
-        """Score some tiles; return whether all passes are done."""
-        if self._passes == 0:
-            return True
-        now = self._queue[: self._each]
-        self._queue = self._queue[self._each :]
-        for i, events in now:
-            self._score(i, events)
-        if self._queue:
-            return False
-        self._passes -= 1
-        if self._passes:
-            self._outside = ~self._stream.suspected(self._result)
-            self._begin()
-        return self._passes == 0
-
-    def finish(self) -> Spatial:
-        """Score all tiles that are left, and return the result."""
-        while not self.step():
-            pass
-        return self._result
-
-    def _score(self, i: int, events: EventLog) -> None:
-        stream = self._stream
-        tile = self._events.tiles[i]
-        cells = self._cells.of(tile.inputs)
-        allowed = self._outside[tile.inputs]
+def _scored(
+    stream: StreamState, cells: CellState, events: TiledEvents, misleading: Mask, outside: Mask
+) -> Spatial:
+    """Return the spatial test of each tile; ``outside`` (bool ``[D]``): its predictors beside its
+    outputs."""
+    result = Spatial(*(np.array(values) for values in vars(Spatial.before(cells)).values()))
+    for i, own in events.kept():
+        tile = events.tiles[i]
+        of_tile = cells.of(tile.inputs)
+        allowed = outside[tile.inputs]
         allowed[tile.place] = True
-        cells = replace(cells, eligible=cells.eligible & allowed)
-        misleading = self._misleading[tile.inputs]
-        test = SpatialTest(
-            events.kept, cells, stream.model_of(i, events), stream.exclusion, misleading
-        )
+        of_tile = replace(of_tile, eligible=of_tile.eligible & allowed)
+        model = stream.model_of(i, own)
+        test = SpatialTest(own.kept, of_tile, model, stream.exclusion, misleading[tile.inputs])
         for name, values in vars(test.finish()).items():
-            getattr(self._result, name)[tile.outputs] = values[tile.place]
-
-
-Test = SpatialTest | _TiledTest
+            getattr(result, name)[tile.outputs] = values[tile.place]
+    return result
 
 
 def _on_rectangle(model: Model, own: Rectangle) -> Model:

@@ -1,5 +1,11 @@
 import copy
+import gc
+import os
 import pickle
+import subprocess
+import sys
+import threading
+from time import sleep
 
 import numpy as np
 import pytest
@@ -68,10 +74,15 @@ def watched(
 ) -> tuple[Monitor, list[tuple[int, Fault]]]:
     """Feed a log frame by frame; return the monitor and (frame, what it reported)."""
     monitor = Monitor(diagnoser)
+    return monitor, told(monitor, frames)
+
+
+def told(monitor: Monitor, frames: np.ndarray) -> list[tuple[int, Fault]]:
+    """Feed frames; return (frame, what the monitor reported)."""
     changes = []
     for i, frame in enumerate(frames):
         changes += [(i, fault) for fault in monitor.update(frame)]
-    return monitor, changes
+    return changes
 
 
 def without_recordings(diagnosis) -> dict:
@@ -116,15 +127,24 @@ def test_a_diagnosis_in_between_changes_nothing(fitted, log, middle):
 def test_a_flush_tells_at_once_what_diagnose_tells(fitted, log, middle):
     for diagnoser in (fitted, COLD):
         frames = inject(log, mixes(middle)["cells"], LAYOUT, seed=0, dither=0.004)[:970]
-        monitor, told = watched(diagnoser, frames)
+        monitor, before = watched(diagnoser, frames)
         changes = monitor.flush()
-        known = {fault.cells: fault for _, fault in told} | {f.cells: f for f in changes}
+        known = {fault.cells: fault for _, fault in before} | {f.cells: f for f in changes}
         faults = monitor.diagnosis().faults
         assert {cells for cells, fault in known.items() if fault.probability} == {
             fault.cells for fault in faults
         }
         assert monitor.flush() == ()
     assert Monitor(fitted).flush() == ()
+
+
+def test_a_flush_tells_what_a_log_shorter_than_a_segment_shows():
+    monitor = Monitor(COLD)
+    silent = np.ones((31, 220))
+    silent[:, 7] = np.nan
+    assert told(monitor, silent) == []
+    assert {cell for fault in monitor.flush() for cell in fault.cells} == {7}
+    assert monitor.diagnosis().fault_set == {7}
 
 
 def test_a_fault_is_reported_once_soon_after_it_is_detectable(fitted, log, middle):
@@ -187,7 +207,7 @@ OTHER = Fault("drift", (7,))
 
 
 @pytest.mark.parametrize(
-    ("evaluations", "told"),
+    ("evaluations", "expected"),
     [
         ([(ONE,), ()], []),  # withdrawn by the next one
         ([(), (ONE, OTHER), (ONE,)], [ONE]),
@@ -197,10 +217,10 @@ OTHER = Fault("drift", (7,))
         ([tuple(Fault("open", (c,)) for c in ROW.cells), (ROW,)], [ROW]),
     ],
 )
-def test_a_change_is_told_once_the_next_evaluation_confirms_it(evaluations, told):
+def test_a_change_is_told_once_the_next_evaluation_confirms_it(evaluations, expected):
     monitor = Monitor(COLD)
     changes = [change for said in evaluations for change in monitor._changes(Said(*said))]
-    assert ["gone" if fault.probability == 0 else fault for fault in changes] == told
+    assert ["gone" if fault.probability == 0 else fault for fault in changes] == expected
     said = {cell for fault in evaluations[-1] for cell in fault.cells}
     assert monitor.evaluated.fault_set == said
     last = {cell for fault in monitor._changes(Said(OTHER), final=True) for cell in fault.cells}
@@ -298,7 +318,8 @@ def test_a_time_that_is_not_finite_is_refused_and_a_clock_that_is_set_loses_no_f
     diagnosis = monitor.diagnosis()
     assert diagnosis.n_frames == 8  # those that were refused are not among them
     assert np.isfinite(diagnosis.probability).all()
-    assert monitor._stream.transport.lost == 1
+    (lost,) = diagnosis.transport
+    assert (lost.kind, lost.frames) == ("lost", 1)
 
 
 @pytest.mark.parametrize(
@@ -309,12 +330,116 @@ def test_a_copy_of_a_monitor_goes_on_as_the_monitor_does_and_apart_from_it(
 ):
     broken = inject(log, [Fault("short", (middle[3],), onset=200)], LAYOUT)
     monitor = Monitor(fitted)
-    for frame in broken[:140]:
-        monitor.update(frame)
-    twin = duplicate(monitor)
-    found = [fault for frame in broken[140:600] for fault in twin.update(frame)]
-    assert middle[3] in {cell for fault in found for cell in fault.cells}
+    told(monitor, broken[:140])
+    twin = duplicate(monitor)  # while frames 0 to 127 are evaluated
+    found = told(twin, broken[140:600])
+    assert middle[3] in {cell for _, fault in found for cell in fault.cells}
     assert monitor.diagnosis().n_frames == 140
-    for frame in broken[140:600]:
-        monitor.update(frame)
+    assert told(monitor, broken[140:600]) == found
     assert twin.diagnosis().to_dict() == monitor.diagnosis().to_dict()
+
+
+def test_which_frame_tells_which_fault_does_not_depend_on_the_speed(
+    fitted, log, middle, monkeypatch
+):
+    frames = inject(log, mixes(middle)["cells"], LAYOUT, seed=0)[:400]
+    _, changes = watched(fitted, frames)
+    evaluate = SelfDiagnosis.evaluate
+
+    def slowly(self, stream, **given):
+        sleep(0.02)
+        return evaluate(self, stream, **given)
+
+    monkeypatch.setattr(SelfDiagnosis, "evaluate", slowly)
+    assert watched(fitted, frames)[1] == changes != []
+
+
+def test_the_first_evaluation_is_there_after_frames_that_the_size_and_the_rate_state():
+    for side, rate, first in ((4, 10.0, 48), (40, 40.0, 128)):  # 1.6 s are 64 frames
+        layout = SensorLayout(1, side, side, rate=rate)
+        monitor = Monitor(SelfDiagnosis(layout))
+        frames = np.random.default_rng(0).uniform(1, 2, (first, layout.n_cells))
+        for frame in frames:
+            assert monitor.evaluated is None
+            monitor.update(frame)
+        assert monitor.evaluated is not None
+
+
+def test_what_an_evaluation_raises_reaches_an_update_and_its_frames_count_as_lost(
+    fitted, log, middle, monkeypatch
+):
+    def fails(self, stream, **given):
+        raise MemoryError("no memory")
+
+    broken = inject(log, [Fault("short", (middle[3],))], LAYOUT)
+    monitor = Monitor(fitted)
+    with monkeypatch.context() as patch:
+        patch.setattr(SelfDiagnosis, "evaluate", fails)
+        assert told(monitor, broken[:47]) == []
+        with pytest.raises(MemoryError, match="no memory"):
+            monitor.update(broken[47])
+    changes = told(monitor, broken[48:400])
+    assert {cell for _, fault in changes for cell in fault.cells} == {middle[3]}
+    (lost,) = monitor.diagnosis().transport
+    assert (lost.kind, lost.frames) == ("lost", 32)
+
+
+def test_the_thread_of_a_monitor_ends_with_it(log):
+    before = set(threading.enumerate())
+    monitor = Monitor(COLD)
+    told(monitor, log[:40])
+    (thread,) = set(threading.enumerate()) - before
+    del monitor
+    gc.collect()
+    thread.join(60)
+    assert not thread.is_alive()
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="this system has no fork")
+@pytest.mark.filterwarnings("ignore:This process:DeprecationWarning")  # it has several threads
+def test_a_forked_process_goes_on_as_the_monitor_does(fitted, log, middle):
+    broken = inject(log, [Fault("short", (middle[3],), onset=100)], LAYOUT)
+    monitor = Monitor(fitted)
+    told(monitor, broken[:130])  # 0 to 127 are evaluated
+    reads, writes = os.pipe()
+    child = os.fork()
+    if child == 0:
+        try:
+            os.write(writes, repr(told(monitor, broken[130:300])).encode())
+        finally:
+            os._exit(0)
+    os.close(writes)
+    expected = told(monitor, broken[130:300])
+    with os.fdopen(reads) as pipe:
+        assert pipe.read() == repr(expected)
+    os.waitpid(child, 0)
+    assert expected
+
+
+WITHOUT_MAIN = """
+import sys, threading
+import numpy as np
+from diagnostics import Monitor, SelfDiagnosis
+
+monitor = Monitor(SelfDiagnosis.load(sys.argv[1]))
+
+def goes_on():
+    threading.main_thread().join()
+    for i, frame in enumerate(np.load(sys.argv[2])):
+        for fault in monitor.update(frame):
+            print(i, fault.cells, flush=True)
+
+threading.Thread(target=goes_on).start()
+"""
+
+
+def test_a_thread_that_outlives_the_main_thread_is_told_the_same(fitted, log, middle, tmp_path):
+    fitted.save(tmp_path / "fitted.npz")
+    frames = inject(log, [Fault("short", (middle[3],), onset=50)], LAYOUT)[:200]
+    np.save(tmp_path / "frames.npy", frames)
+    script = (sys.executable, "-c", WITHOUT_MAIN)
+    given = (str(tmp_path / "fitted.npz"), str(tmp_path / "frames.npy"))
+    done = subprocess.run((*script, *given), capture_output=True, text=True, timeout=300)
+    assert (done.returncode, done.stderr) == (0, "")
+    expected = [f"{i} {fault.cells}" for i, fault in watched(fitted, frames)[1]]
+    assert done.stdout.splitlines() == expected != []

@@ -79,7 +79,7 @@ def test_a_row_across_several_tiles_is_excluded_from_the_predictors_as_a_group(f
         inject(log(SKIN, 100, 40), [line_fault(SKIN, Line(0, "row", 11), FaultKind.OPEN)], SKIN)
     )
     stream = stream.complete()
-    spatial = stream.spatial().finish()
+    spatial = stream.spatial()
     none = np.zeros(SKIN.n_cells, bool)
     of_row, of_one = stream.each_excluded(spatial, none, [row, row[:1]])
     assert len({i for i, tile in enumerate(tiles(SKIN)) if np.isin(row, tile.outputs).any()}) > 1

@@ -12,7 +12,6 @@ from diagnostics import Fault, FaultKind, Line, Monitor, SelfDiagnosis, Verdict,
 from diagnostics.evidence.life import EvidenceOfLog, LifeRecord, LifeTest
 from diagnostics.evidence.life.healthy_table import ConditionalMean
 from diagnostics.evidence.life.record import KEPT
-from diagnostics.evidence.stepping import finished
 from diagnostics.simulation.circuit import Circuit, StuckCell
 
 
@@ -233,7 +232,7 @@ def test_a_level_that_a_cell_has_all_the_time_is_no_contradiction_whatever_was_e
     context = np.broadcast_to(likeliest, pieces.level.shape)
     always = pieces.tilted(model.probabilities, context, np.full(pieces.level.shape, 3))
     assert (always > np.log(0.9)).all()
-    healthy, context = finished(pieces.healthy(np.ones(len(each), bool)))
+    healthy, context = pieces.healthy(np.ones(len(each), bool))
     plain = model.table[model.of_cell(each), context, pieces.level]
     assert healthy.mean() > plain.mean()
 

@@ -1,3 +1,5 @@
+from copy import copy
+
 import numpy as np
 import pytest
 
@@ -123,7 +125,7 @@ def test_looking_at_it_in_between_changes_nothing():
     stream = StreamState(LAYOUT, UNKNOWN, Exclusion(2.0))
     for first in range(0, 1800, 29):
         stream.extend(log[first : first + 29])
-        stream.complete().spatial().finish()
+        stream.complete().spatial()
     assert differences(stream.complete(), remembered(log)) == []
 
 
@@ -135,6 +137,15 @@ def test_completing_a_state_leaves_it_as_it_was():
     assert stream.complete().runs.length.max() == 50
     assert stream.runs is before
     assert before.length.max() < 50
+
+
+def test_a_copy_takes_in_frames_of_its_own():
+    log = broken()[:500]
+    stream = StreamState(LAYOUT, UNKNOWN, Exclusion(2.0))
+    stream.extend(log[:50])
+    copy(stream).extend(log[200:300])
+    stream.extend(log[50:])
+    assert differences(stream.complete(), remembered(log)) == []
 
 
 def test_it_stays_of_constant_size_over_a_long_log():
@@ -158,7 +169,7 @@ def test_evidence_of_dropped_events_still_counts():
     assert stream.local.of[0].kept[0].first > 1000
     assert stream.accumulated[cell] > 10
     few = remembered(log[stream.local.of[0].kept[0].first :])
-    evidence, without = (m.spatial().finish().surprisal[cell] for m in (stream, few))
+    evidence, without = (m.spatial().surprisal[cell] for m in (stream, few))
     assert evidence > without + 5
 
 

@@ -39,7 +39,6 @@ from diagnostics.evidence.life.tables import (
 )
 from diagnostics.evidence.life.ways_to_fail import EvidenceOfLog
 from diagnostics.evidence.life.wires import tested_wires
-from diagnostics.evidence.stepping import finished
 from diagnostics.preprocessing.levels import FEWEST
 from diagnostics.preprocessing.scale import Array
 
@@ -178,7 +177,7 @@ class _Fit:
                 some, equal = log.same(k)
                 loaded[:, k] += some.sum(axis=0)
                 same[:, k] += equal.sum(axis=0)
-            some, level = finished(log.amid())
+            some, level = log.amid()
             for n in range(len(AMID) + 1):
                 amid[:, n] += (some & (level == n)).sum(axis=0)
         same *= model.independent
@@ -221,7 +220,7 @@ class _Fit:
         log = LifeLog(
             fold.loads, fold.readings, fold.constant, fold.piece, model, self._layout.beside
         )
-        healthy, _ = finished(log.healthy(self._present))
+        healthy, _ = log.healthy(self._present)
         return log.by_unit(log.own - healthy)
 
     def _independent_share(self, held_out: list[LifeModel]) -> float:
@@ -245,7 +244,7 @@ class _Fit:
                     model,
                     self._layout.beside,
                 )
-                healthy, _ = finished(log.healthy(self._present))
+                healthy, _ = log.healthy(self._present)
                 counted = log.counted(log.own - healthy)
                 each.append(counted - counted.mean(axis=0))
         alone = sum(float((of**2).sum()) for of in each)
@@ -291,7 +290,7 @@ class _Fit:
                         test = LifeTest(evidence, self._present)
                         test.finish()
                         known = test.known
-                    found = finished(evidence.ways(known)).evidence[:, healthy]
+                    found = evidence.ways(known).evidence[:, healthy]
                     reached[:, healthy] = np.maximum(reached[:, healthy], found)
                     usual.append(found)
                     units.append(evidence.log.units)
@@ -300,13 +299,13 @@ class _Fit:
                     if model.wires is not None:
                         out = model.wires.on[of_wire.integers(len(model.wires.on))]
                         for without in (np.zeros_like(out), out):
-                            steps = tested_wires(
+                            tested = tested_wires(
                                 evidence.log,
                                 model.wires,
                                 known & ~without,
                                 self._present & ~without,
                             )
-                            of_wires.append(finished(steps).evidence)
+                            of_wires.append(tested.evidence)
         most = np.quantile(np.concatenate(usual, axis=1), _HEALTHY, axis=1)
         reached = np.maximum(reached, most[:, None])
         wires = np.max(of_wires, axis=0, initial=0.0)[None] if of_wires else np.zeros((1, 0))

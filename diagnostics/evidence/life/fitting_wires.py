@@ -22,7 +22,6 @@ from diagnostics.evidence.life.tables import (
     shrinkage_of,
 )
 from diagnostics.evidence.life.wires import wire_log
-from diagnostics.evidence.stepping import finished
 from diagnostics.healthy.cross_fitting import FOLDS
 from diagnostics.preprocessing.levels import FEWEST
 
@@ -89,7 +88,7 @@ def fit_wires(
     ratios = []
     for model, fold, wires in zip(held_out, folds, models, strict=True):
         log = LifeLog(fold.loads, fold.readings, fold.constant, fold.piece, model, layout.beside)
-        own, _, healthy = finished(wire_log(log, wires, present, present))
+        own, _, healthy = wire_log(log, wires, present, present)
         ratios.append(own.by_unit(own.own - healthy))
     used = np.sum([(own > UNLOADED).sum(axis=0) for own in loads], axis=0) >= FEWEST
     errs, without = shares_of_errors(ratios, blank.independent, every, used)
@@ -102,8 +101,7 @@ def _expected(wires: WireModel, model: LifeModel, fold: Fold, present: Mask) -> 
     """Return the predicted mean loads ``[n, W]``, where some cells are unknown."""
     found = np.empty((len(fold.loads), len(wires.on)))
     for part, known in unknown_parts(len(found), present, np.random.default_rng(1)):
-        steps = wires.expected(model.means, fold.loads[part], known, present)
-        found[part] = finished(steps)
+        found[part] = wires.expected(model.means, fold.loads[part], known, present)
     return found
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator, Iterator
 from functools import cached_property
 
 import numpy as np
@@ -21,7 +20,6 @@ from diagnostics.evidence.life.healthy_table import (
 )
 from diagnostics.evidence.life.life_model import LifeModel
 from diagnostics.evidence.life.record import PIECE, LifeRecord
-from diagnostics.evidence.stepping import finished
 from diagnostics.preprocessing.readings import spread
 from diagnostics.preprocessing.scale import Array
 
@@ -30,7 +28,6 @@ _THE_SAME = 0.1  # relative difference of loads that are the same
 _TILTED = 8.0  # pseudo-count of pieces, of the frequency of a level
 _FITS = 3  # of the tilt, by iterative proportional fitting: a size
 _MOST_TILT = 16.0  # times as frequent as expected, or as rare, levels of healthy cells are in a log
-_TOGETHER = 48  # units that are compared in one step: a size
 _SATURATED = 50.0  # log ratio of a unit beyond which nothing changes
 
 
@@ -101,30 +98,15 @@ class LevelLog:
         found[self.level == 0] = np.log(_AT_REST)
         return found
 
-    @property
+    @cached_property
     def weight(self) -> Floats:
         """Weight of each unit ``[units]``: share of independent ones, over 1 + k with k others of
         the same loads."""
-        if self._weight is None:
-            self._weight = finished(self._weighed())
-        return self._weight
-
-    def _weighed(self) -> Generator[None, None, Floats]:
-        """Yield between steps; return the weight of each unit."""
-        length = np.diff(np.append(self.unit_begins, len(self.loads)))[:, None]
-        novelty = yield from _novelty(
-            np.add.reduceat(self.loads, self.unit_begins, axis=0) / length
-        )
-        return self.table.independent * novelty
-
-    def prepared(self) -> Iterator[None]:
-        """Yield after the work that every test needs, unless it is done."""
         if self._weight is not None:
-            return
-        _ = self.own, self.at_rest
-        yield
-        self._weight = yield from self._weighed()
-        yield
+            return self._weight
+        length = np.diff(np.append(self.unit_begins, len(self.loads)))[:, None]
+        means = np.add.reduceat(self.loads, self.unit_begins, axis=0) / length
+        return self.table.independent * _novelty(means)
 
     def tilted(
         self, table: Floats, context: NDArray[np.intp], level: NDArray[np.integer]
@@ -220,13 +202,13 @@ class LifeLog(LevelLog):
         log.ends_as_one = record.frames_as_one if record.ends_as_one else None
         return log
 
-    def healthy(self, known: Mask) -> Generator[None, None, tuple[Floats, NDArray[np.intp]]]:
-        """Yield between steps; return log P(level | healthy) and the context, ``[n, D]`` each.
+    def healthy(self, known: Mask) -> tuple[Floats, NDArray[np.intp]]:
+        """Return log P(level | healthy) and the context, ``[n, D]`` each.
 
         Args:
             known: bool ``[D]``, the cells that predict others.
         """
-        context = yield from self.model.contexts(self.loads, known, self.beside)
+        context = self.model.contexts(self.loads, known, self.beside)
         table = self.model.probabilities[self.model.of_cell(self._cell)]
         return self.tilted(table, context, self.level), context
 
@@ -240,8 +222,8 @@ class LifeLog(LevelLog):
         some = self.any_by_unit(either)
         return some, some & ~self.any_by_unit(differs)
 
-    def amid(self) -> Generator[None, None, tuple[Mask, Levels]]:
-        """Yield between steps; return how far a cell is from the mean of those beside it.
+    def amid(self) -> tuple[Mask, Levels]:
+        """Return how far a cell is from the mean of those beside it.
 
         The distance is relative to the mean distance of the cells beside it from their mean,
         without the farthest one: it may be dead.
@@ -258,14 +240,12 @@ class LifeLog(LevelLog):
             mean += np.where(has[:, k], self.readings[:, other], 0.0)
             some |= (self.level[:, other] > 0) & has[:, k]
         mean /= count
-        yield
         total_beside = np.zeros(self.readings.shape)
         farthest = np.zeros(self.readings.shape)
         for k, other in enumerate(self.beside.T):
             away = np.where(has[:, k], np.abs(self.readings[:, other] - mean), 0.0)
             total_beside += away
             np.maximum(farthest, away, out=farthest)
-        yield
         usual_beside = (total_beside - farthest) / (count - 1)
         distance = np.abs(self.readings - mean) / (usual_beside + self.model.tolerance)
         some &= (self.level > 0) & self._read & (has.sum(axis=1) > 1) & np.isfinite(distance)
@@ -281,9 +261,8 @@ def _counted(numbers: NDArray[np.integer], n: int) -> NDArray[np.intp]:
     return np.bincount(index.ravel(), minlength=n * d).reshape(d, n)
 
 
-def _novelty(means: Floats) -> Generator[None, None, Floats]:
-    """Yield between steps; return the weight of each unit, ``[units]``, of the mean root loads in
-    it, ``[units, D]``.
+def _novelty(means: Floats) -> Floats:
+    """Return the weight of each unit, ``[units]``, of the mean root loads in it, ``[units, D]``.
 
     Two units have the same loads if these differ by less than a tenth, over the cells whose loads
     change at all.
@@ -293,8 +272,6 @@ def _novelty(means: Floats) -> Generator[None, None, Floats]:
     size = changing.sum(axis=1)
     repeats = np.zeros(len(means))
     for u, one in enumerate(changing):
-        if u % _TOGETHER == _TOGETHER - 1:
-            yield
         differ = np.abs(changing - one).sum(axis=1)
         repeats[u] = (differ <= _THE_SAME * np.maximum(size, size[u])).sum() - 1
     return 1 / (1 + repeats)

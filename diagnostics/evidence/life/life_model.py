@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Generator, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -35,7 +35,6 @@ if TYPE_CHECKING:
     from diagnostics.layout import SensorLayout
     from diagnostics.wiring import LineKind
 
-_STEPS = 4  # of a prediction: a size
 _NOISIER = 2  # single frames than their mean in a piece
 
 
@@ -115,9 +114,8 @@ class WireModel(HealthyTable):
 
     def expected(
         self, means: Sequence[ConditionalMean], loads: Array, known: Mask, eligible: Mask
-    ) -> Generator[None, None, Floats]:
-        """Yield between steps; return the mean load that the known cells off each wire predict,
-        ``[n, W]``.
+    ) -> Floats:
+        """Return the mean load that the known cells off each wire predict, ``[n, W]``.
 
         Args:
             means: predictions of the cells.
@@ -132,7 +130,6 @@ class WireModel(HealthyTable):
                 if of[mean.outputs].any():
                     found[:, w] += mean.expected_sum(loads, known, on, of)
             found[:, w] /= max(1, of.sum())
-            yield
         return found
 
 
@@ -278,17 +275,11 @@ class LifeModel(HealthyTable):
             found[:, mean.outputs] = mean.predict(loads, known)
         return found
 
-    def contexts(
-        self, loads: Array, known: Mask, beside: Cells
-    ) -> Generator[None, None, NDArray[np.intp]]:
-        """Yield between steps; return what the others say of each cell, 0 to M - 1, int
-        ``[n, D]``."""
+    def contexts(self, loads: Array, known: Mask, beside: Cells) -> NDArray[np.intp]:
+        """Return what the others say of each cell, 0 to M - 1, int ``[n, D]``."""
         level = np.zeros(loads.shape, np.uint8)
-        each = -(-len(self.means) // _STEPS)
-        for k, mean in enumerate(self.means):
+        for mean in self.means:
             level[:, mean.outputs] = levels_of(mean.predict(loads, known), self.predicted)
-            if k % each == 0:
-                yield
         around = loaded_beside(loads, known, beside)
         return level.astype(np.intp) * (len(BESIDE) + 1) + around
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import logsumexp
@@ -16,11 +14,9 @@ _RECOVERS = 0.3  # probability per unit
 _LIMITS = 4  # of the load from which on a contact opens
 
 
-def opens_under_load(
-    log: LevelLog, ratio: Floats, expected: NDArray[np.integer]
-) -> Generator[None, None, Floats]:
-    """Yield between steps; return the evidence ``[D]`` of what is dead where its load should exceed
-    some level, and healthy below.
+def opens_under_load(log: LevelLog, ratio: Floats, expected: NDArray[np.integer]) -> Floats:
+    """Return the evidence ``[D]`` of what is dead where its load should exceed some level, and
+    healthy below.
 
     Args:
         log: the levels of the log.
@@ -30,7 +26,6 @@ def opens_under_load(
     evidence = []
     for level in np.linspace(1, len(log.table.predicted), _LIMITS).astype(np.intp):
         evidence.append(log.counted(np.where(expected >= level, ratio, 0.0)).sum(axis=0))
-        yield
     found: Floats = logsumexp(evidence, axis=0) - np.log(_LIMITS)
     return found
 

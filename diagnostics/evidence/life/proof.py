@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -29,7 +28,6 @@ from diagnostics.evidence.life.ways_to_fail import (
     responses,
 )
 from diagnostics.evidence.life.wires import FailingWires, failing_wires
-from diagnostics.evidence.stepping import finished
 from diagnostics.preprocessing.levels import DOUBTED, EXPECTED, FEWEST, MAJORITY
 
 _SHARES = (0.4, 0.3, 0.1, 0.1, 0.1)  # of the FAULTS among faults
@@ -177,37 +175,31 @@ class LifeTest:
 
     def finish(self) -> Life:
         """Return the result."""
-        return finished(self.steps())
-
-    def steps(self) -> Generator[None, None, Life]:
-        """Yield between steps of a few milliseconds; return the result."""
         evidence = self._evidence
         if evidence is None:
             return Life.unknown(len(self._eligible))
         log = evidence.log
-        yield from log.prepared()
         if self.wires is None:
-            yield from self._settled(evidence, np.zeros_like(self._eligible))
+            self._settled(evidence, np.zeros_like(self._eligible))
             known = self._eligible & ~self._constant
-            self.wires = yield from failing_wires(log, self.known, known)
+            self.wires = failing_wires(log, self.known, known)
             if self.wires.refuted.any():
-                yield from self._settled(evidence, self.wires.refuted)
+                self._settled(evidence, self.wires.refuted)
         else:
-            yield from self._settled(evidence, self.wires.refuted)
+            self._settled(evidence, self.wires.refuted)
         wires = self.wires
-        ways = yield from evidence.ways(self.known)
-        yield
+        ways = evidence.ways(self.known)
         life = _concluded(log, ways, self._eligible, self._constant, wires)
-        life = yield from _without_followers(log, ways, life)
+        life = _without_followers(log, ways, life)
         return _with_weak(log, self.known, life)
 
-    def _settled(self, evidence: EvidenceOfLog, out: Mask) -> Generator[None, None, None]:
-        """Yield between steps; find the cells that predict others, without those that are
+    def _settled(self, evidence: EvidenceOfLog, out: Mask) -> None:
+        """Find the cells that predict others, without those that are
         ``out`` (bool ``[D]``)."""
         log = evidence.log
         refuted = np.zeros(len(self._eligible), np.intp)  # how often each cell was
         self.known = self.known & ~out
-        seen = yield from evidence.suspicion(self.known)
+        seen = evidence.suspicion(self.known)
         for _ in range(_ROUNDS):
             bad = self._eligible & seen.refuted(log)
             gone = self._worst(seen, bad, log.beside)
@@ -218,8 +210,7 @@ class LifeTest:
             if (known == self.known).all():
                 break
             self.known = known
-            yield
-            seen = yield from evidence.suspicion(known)
+            seen = evidence.suspicion(known)
 
     def _worst(self, seen: Suspicion, bad: Mask, beside: Cells) -> Mask:
         """Return the worst of the ``bad`` cells that predict others, bool ``[D]``.
@@ -235,9 +226,8 @@ class LifeTest:
         return found
 
 
-def _without_followers(log: LifeLog, ways: WaysToFail, life: Life) -> Generator[None, None, Life]:
-    """Yield between steps; return the result where cells that follow the others otherwise are not
-    floating.
+def _without_followers(log: LifeLog, ways: WaysToFail, life: Life) -> Life:
+    """Return the result where cells that follow the others otherwise are not floating.
 
     A load that lies still, another specimen, a weak cell: it reads otherwise, but it follows the
     others.
@@ -245,7 +235,7 @@ def _without_followers(log: LifeLog, ways: WaysToFail, life: Life) -> Generator[
     cells = np.flatnonzero((life.refuted | life.certain) & (life.kind == 0))
     if not len(cells):
         return life
-    better = yield from follows_otherwise(log, ways, cells)
+    better = follows_otherwise(log, ways, cells)
     evidence = life.evidence.copy()
     follows = cells[better > REFUTED]
     evidence[follows] = np.minimum(evidence[follows], 0.0)

@@ -17,8 +17,6 @@ not load, ghosts on a line that reads as much as it should.
 
 from __future__ import annotations
 
-from collections.abc import Generator
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -30,10 +28,8 @@ _OUTLYING = 1.645 * 1.48  # median absolute deviations: one-sided, 5 %
 _PULLED = float(np.log(2 / 3)) / 2  # of the root load
 
 
-def pulled_lines(
-    log: LifeLog, shorted: NDArray[np.intp], known: Mask
-) -> Generator[None, None, Mask]:
-    """Yield between steps; return the cells on pulled lines, bool ``[D]``.
+def pulled_lines(log: LifeLog, shorted: NDArray[np.intp], known: Mask) -> Mask:
+    """Return the cells on pulled lines, bool ``[D]``.
 
     Args:
         log: the levels of the log.
@@ -47,7 +43,7 @@ def pulled_lines(
     of_shorted = wires.on[:, shorted].any(axis=1)
     lines = known & ~wires.on[of_shorted].any(axis=0)
     # Those on the lines in question tell nothing of the others.
-    expected = yield from wires.expected(log.model.means, log.loads, lines, known)
+    expected = wires.expected(log.model.means, log.loads, lines, known)
     ratio = _log_ratio(wires.means(log.loads, known), expected)
     others = ratio[~of_shorted & np.isfinite(ratio)]
     if len(others) < FEWEST:

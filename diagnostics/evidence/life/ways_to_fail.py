@@ -6,7 +6,7 @@ Each is a log likelihood ratio fault : healthy, summed over the units of the log
 
 from __future__ import annotations
 
-from collections.abc import Generator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -43,8 +43,6 @@ _OTHERWISE = (
     *((1.0, offset) for offset in (0.02, 0.05, 0.1, 0.2, 0.4)),
 )
 _FEWEST_SEGMENTS = 2  # with load
-_PASSED = 300_000  # readings: a size
-_MOST_PASSES = 4  # a size
 _KEPT = 3  # answers: a size
 # P(distance from the mean beside it) of a cell that reads it; dead cells beside it read otherwise.
 _AMID = (0.7, 0.15, 0.07, 0.04, 0.04)
@@ -137,23 +135,23 @@ class EvidenceOfLog:
             return None
         return cls(LifeLog.of(record, model, beside))
 
-    def suspicion(self, known: Mask) -> Generator[None, None, Suspicion]:
-        """Yield between steps; return the evidence of the two faults that all others are near."""
+    def suspicion(self, known: Mask) -> Suspicion:
+        """Return the evidence of the two faults that all others are near."""
         key = known.tobytes()
         if key not in self._seen:
             _forget(self._seen)
-            self._seen[key] = yield from suspicion(self.log, known)
+            self._seen[key] = suspicion(self.log, known)
         return self._seen[key]
 
-    def ways(self, known: Mask) -> Generator[None, None, WaysToFail]:
-        """Yield between steps; return the evidence of each fault."""
+    def ways(self, known: Mask) -> WaysToFail:
+        """Return the evidence of each fault."""
         key = known.tobytes()
         if key not in self._ways:
             _forget(self._ways)
-            seen = yield from self.suspicion(known)
+            seen = self.suspicion(known)
             if not self._alike:
-                self._alike = yield from _alike(self.log)
-            self._ways[key] = yield from ways_to_fail(self.log, known, seen, self._alike)
+                self._alike = _alike(self.log)
+            self._ways[key] = ways_to_fail(self.log, known, seen, self._alike)
         return self._ways[key]
 
 
@@ -163,30 +161,21 @@ def _forget(answers: dict[bytes, Any]) -> None:
         del answers[next(iter(answers))]
 
 
-def _at_once(readings: int) -> int:
-    """Return how many passes over so many readings take about a millisecond."""
-    return int(np.clip(_PASSED // readings, 1, _MOST_PASSES))
-
-
-def suspicion(log: LifeLog, known: Mask) -> Generator[None, None, Suspicion]:
-    """Yield between steps; return the evidence of the two faults, where only the ``known`` cells
-    predict others."""
-    healthy, context = yield from log.healthy(known)
-    yield
+def suspicion(log: LifeLog, known: Mask) -> Suspicion:
+    """Return the evidence of the two faults, where only the ``known`` cells predict others."""
+    healthy, context = log.healthy(known)
     by_unit = log.counted(log.own - healthy)
     dead = log.counted(log.at_rest - healthy)
     intermittent, dying = dies_and_recovers(dead)
     around = len(BESIDE) + 1
-    opens = yield from opens_under_load(log, log.at_rest - healthy, context // around)
+    opens = opens_under_load(log, log.at_rest - healthy, context // around)
     return Suspicion(
         healthy, context, by_unit.sum(axis=0), intermittent, opens, by_unit, dead, dying
     )
 
 
-def ways_to_fail(
-    log: LifeLog, known: Mask, seen: Suspicion, alike: Sequence[Floats]
-) -> Generator[None, None, WaysToFail]:
-    """Yield between steps; return the evidence of each fault.
+def ways_to_fail(log: LifeLog, known: Mask, seen: Suspicion, alike: Sequence[Floats]) -> WaysToFail:
+    """Return the evidence of each fault.
 
     Args:
         log: the levels of the log.
@@ -194,15 +183,10 @@ def ways_to_fail(
         seen: the evidence of the first two faults, given these.
         alike: evidence ``[D]`` that a cell repeats each of those beside it, or their mean.
     """
-    copy, source = yield from _copies(log, known, seen, alike)
-    yield
+    copy, source = _copies(log, known, seen, alike)
     if (known & (copy > REFUTED)).any():
-        seen = yield from suspicion(log, known & (copy <= REFUTED))
-        yield
-    lagged = []
-    for lag in _LAGS:
-        lagged.append(_late(log, seen, lag))
-        yield
+        seen = suspicion(log, known & (copy <= REFUTED))
+    lagged = [_late(log, seen, lag) for lag in _LAGS]
     late = logsumexp(lagged, axis=0) - np.log(len(lagged))
     clamped = _clamped(log, seen.context)
     # What was dead once, and works again, is no fault any more.
@@ -229,21 +213,15 @@ def ways_to_fail(
     )
 
 
-def follows_otherwise(
-    log: LifeLog, ways: WaysToFail, cells: Cells
-) -> Generator[None, None, Floats]:
-    """Yield between steps; return the log ratio follows with another gain or offset : not at all,
-    ``[cells]``."""
+def follows_otherwise(log: LifeLog, ways: WaysToFail, cells: Cells) -> Floats:
+    """Return the log ratio follows with another gain or offset : not at all, ``[cells]``."""
     healthy = ways.healthy[:, cells]
     context = ways.context[:, cells]
     level = log.level[:, cells]
     own = log.own[:, cells]
     independent = from_some_unit(log.counted(own - healthy, cells))
     best = np.full(len(cells), -np.inf)
-    each = _at_once(level.size)
-    for k, (gain, offset) in enumerate(_OTHERWISE):
-        if k % each == 0:
-            yield
+    for gain, offset in _OTHERWISE:
         changed = log.tilted(log.model.otherwise(gain, offset, cells), context, level)
         evidence = from_some_unit(log.counted(changed - healthy, cells))
         best = np.maximum(best, evidence)
@@ -298,13 +276,11 @@ def _clamped(log: LifeLog, context: NDArray[np.intp]) -> Floats:
     return evidence
 
 
-def _alike(log: LifeLog) -> Generator[None, None, tuple[Floats, ...]]:
-    """Yield between steps; return the evidence ``[D]`` that a cell repeats each of those beside it,
-    and their mean."""
+def _alike(log: LifeLog) -> tuple[Floats, ...]:
+    """Return the evidence ``[D]`` that a cell repeats each of those beside it, and their mean."""
     errs = log.model.errs
     of_different = bounded(np.log(errs), errs)
     evidence = []
-    each = _at_once(log.level.size)
     for k, other in enumerate(log.beside.T):
         of_same = bounded(-np.log(log.model.equal[:, k]), errs)
         either, same = log.same(k)
@@ -313,17 +289,14 @@ def _alike(log: LifeLog) -> Generator[None, None, tuple[Floats, ...]]:
             n_same * of_same + (either.sum(axis=0) - n_same) * of_different
         )
         evidence.append(np.where(other >= 0, found, -np.inf))
-        if k % each == 0:
-            yield
-    evidence.append((yield from _mean_of_others(log)))
+    evidence.append(_mean_of_others(log))
     return tuple(evidence)
 
 
 def _copies(
     log: LifeLog, known: Mask, seen: Suspicion, alike: Sequence[Floats]
-) -> Generator[None, None, tuple[Floats, NDArray[np.intp]]]:
-    """Yield between steps; return the evidence ``[D]`` that a cell repeats one beside it, and
-    which, int ``[D]``.
+) -> tuple[Floats, NDArray[np.intp]]:
+    """Return the evidence ``[D]`` that a cell repeats one beside it, and which, int ``[D]``.
 
     Or the mean of those beside it: -1. Either cell of two that read the same may be the copy: the
     one that fits worse to the others, without both.
@@ -339,7 +312,7 @@ def _copies(
         without = known.copy()
         without[pairs] = False
         without[source[pairs]] = False
-        healthy, _ = yield from log.healthy(without)
+        healthy, _ = log.healthy(without)
         fits = log.counted(healthy - log.own).sum(axis=0)
         worse = fits[source[pairs]] - fits[pairs]
         copies = total[pairs] + log_expit(worse)
@@ -348,10 +321,9 @@ def _copies(
     return total, source
 
 
-def _mean_of_others(log: LifeLog) -> Generator[None, None, Floats]:
-    """Yield between steps; return the evidence ``[D]`` that a cell reads the mean of those beside
-    it."""
-    some, level = yield from log.amid()
+def _mean_of_others(log: LifeLog) -> Floats:
+    """Return the evidence ``[D]`` that a cell reads the mean of those beside it."""
+    some, level = log.amid()
     healthy = log.model.amid[np.arange(level.shape[1]), level]
     ratio = np.where(some, np.log(np.asarray(_AMID)[level] / healthy), 0.0)
     evidence: Floats = (bounded(ratio, log.model.errs) * log.weight[:, None]).sum(axis=0)

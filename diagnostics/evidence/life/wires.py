@@ -12,7 +12,6 @@ level while it is open. A wire that breaks once and for all is found by its cons
 
 from __future__ import annotations
 
-from collections.abc import Generator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -112,9 +111,9 @@ class FailingWires:
 
 def wire_log(
     log: LifeLog, wires: WireModel, known: Mask, eligible: Mask
-) -> Generator[None, None, tuple[LevelLog, NDArray[np.intp], Floats]]:
-    """Yield between steps; return the levels of the wires, what the others say of them, and
-    log P(level | healthy), ``[n, W]``.
+) -> tuple[LevelLog, NDArray[np.intp], Floats]:
+    """Return the levels of the wires, what the others say of them, and log P(level | healthy),
+    ``[n, W]``.
 
     Args:
         log: the levels of the cells.
@@ -126,24 +125,21 @@ def wire_log(
     readings = np.where(told, wires.means(log.readings, eligible), np.nan)
     means = wires.means(log.loads, eligible)
     own = LevelLog(means, readings, log.piece, wires, log.weight)
-    expected = yield from wires.expected(log.model.means, log.loads, known, eligible)
+    expected = wires.expected(log.model.means, log.loads, known, eligible)
     context = wires.contexts(expected, means, log.loads, log.piece, known)
     healthy = own.tilted(wires.probabilities, context, own.level)
     return own, context, healthy
 
 
-def tested_wires(
-    log: LifeLog, wires: WireModel, known: Mask, eligible: Mask
-) -> Generator[None, None, WireTest]:
-    """Yield between steps; return the evidence of each wire; arguments as in :func:`wire_log`."""
-    own, context, healthy = yield from wire_log(log, wires, known, eligible)
-    yield
+def tested_wires(log: LifeLog, wires: WireModel, known: Mask, eligible: Mask) -> WireTest:
+    """Return the evidence of each wire; arguments as in :func:`wire_log`."""
+    own, context, healthy = wire_log(log, wires, known, eligible)
     ratio = own.at_rest - healthy
     # A load that is not predicted, as of a faulty cell on the wire, is no sign of an open one.
     ratio = np.where(own.level > 0, np.minimum(ratio, 0.0), ratio)
     dead = own.counted(ratio)
     intermittent, _ = dies_and_recovers(dead)
-    opens = yield from opens_under_load(own, ratio, context // wires.per_level)
+    opens = opens_under_load(own, ratio, context // wires.per_level)
     evidence = np.maximum(intermittent, opens)
     # Its cells tell more of a wire that broke once and for all: the value that they hold, since
     # when.
@@ -160,16 +156,14 @@ def tested_wires(
     return WireTest(np.where(enough, evidence, 0.0), dead)
 
 
-def failing_wires(log: LifeLog, known: Mask, eligible: Mask) -> Generator[None, None, FailingWires]:
-    """Yield between steps; return what the wires say of each cell; arguments as in
-    :func:`wire_log`."""
+def failing_wires(log: LifeLog, known: Mask, eligible: Mask) -> FailingWires:
+    """Return what the wires say of each cell; arguments as in :func:`wire_log`."""
     failing = _failing_groups(log, eligible)
-    yield
     wires = log.model.wires
     found = 0
     while wires is not None:
         free = ~failing.refuted
-        test = yield from tested_wires(log, wires, known & free, eligible & free)
+        test = tested_wires(log, wires, known & free, eligible & free)
         scaled = test.evidence * wires.factors(log.units)[0]
         of_cell = np.where(wires.on & eligible & free, scaled[:, None], 0.0).max(axis=0)
         failing = replace(failing, evidence=np.maximum(failing.evidence, of_cell))

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from adaptfault.inspection.codes import CODES, Code
+from adaptfault.inspection.code import Code
+from adaptfault.inspection.code_list import CODES
 
 PAGE = Path(__file__).with_name("codes.md")
 

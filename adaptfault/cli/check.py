@@ -67,6 +67,7 @@ class Check(Inspecting):
         """Check a data set; the exit code says how bad it is."""
         from adaptfault.inspection.check_log import check_log
         from adaptfault.inspection.findings import FailOn
+        from adaptfault.inspection.naming import Naming
 
         fails = None if self.fail_on is None else FailOn.parse(self.fail_on)
         if self.write_valid:
@@ -77,17 +78,19 @@ class Check(Inspecting):
         inspected = inspect_log(self, part)
         log = inspected.log
         report_range(log)
-        judged = inspected.judged(self.untested_code)
+        named = Naming.of(log).of_inspection(inspected.inspection)
+        inspected = replace(inspected, inspection=named)
+        judged = replace(named, findings=inspected.judged(self.untested_code))
         checked = check_log(
             log,
-            replace(inspected.inspection, findings=judged),
+            judged,
             left_out=self.left_out,
             compared=bool(self.reference or self.healthy),
             source=", ".join(self.recordings),
         )
         code = checked.severity if fails is None else checked.findings.failed(fails)
         notes = [one.text for one in inspected.reasons(self.untested_code) if one.text]
-        notes += checked.remarks
+        notes += [*checked.remarks, *checked.advice]
         _write(self, log, checked, code, notes)
         self._tell(checked, notes)
         return code
@@ -104,10 +107,15 @@ class Check(Inspecting):
         elif self.format == "markdown":
             text = findings.markdown(numbering)
         else:
-            told = text_of(checked.inspection.diagnosis, notes, self.count_from)
+            say = checked.naming.text
+            told = text_of(checked.inspection.diagnosis, notes, self.count_from, say)
             told = with_codes(told, findings, numbering.text)
             left = [f"not checked: {numbering.text(one.what)}" for one in findings.unchecked]
-            summary = numbering.text(str(checked.summary))
+            summary = numbering.text(say(str(checked.summary)))
+            if checked.naming.pads:
+                pads = enumerate(checked.naming.pads, self.count_from)
+                told_pads = ", ".join(f"{number} {name}" for number, name in pads)
+                summary += f"\n{'pads':12s} {told_pads}"
             text = "\n".join([f"{summary}\n\n{told}", *left, findings.summary()])
         self.json |= self.format == "json"
         self.emit(checked.to_dict(), text)
@@ -142,7 +150,7 @@ def _write(args: Check, log: Opened, checked: DataSetCheck, code: int, notes: li
     if args.badge:
         atomic_write(args.badge, checked.badge().encode())
     compared = bool(args.reference or args.healthy)
-    write_page(args, diagnosis, code, notes, compared=compared)
+    write_page(args, diagnosis, code, notes, compared=compared, of_a_data_set=True)
     if args.write_valid:
         from adaptfault.data.recordings.valid import valid_masks, write_valid
 

@@ -23,7 +23,8 @@ class Explain(Command):
 
     def run(self) -> int:
         """Print it."""
-        from adaptfault.inspection.codes import CODES, code_of
+        from adaptfault.inspection.code_list import CODES
+        from adaptfault.inspection.codes import code_of
         from adaptfault.schemas import SCHEMAS, schema_of
 
         if self.code is None:

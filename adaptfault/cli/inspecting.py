@@ -91,12 +91,18 @@ def inspect_log(
 
 
 def write_page(
-    args: Paged, diagnosis: Diagnosis, code: int, notes: list[str], *, compared: bool
+    args: Paged,
+    diagnosis: Diagnosis,
+    code: int,
+    notes: list[str],
+    *,
+    compared: bool,
+    of_a_data_set: bool = False,
 ) -> None:
     """Write the page that ``--html`` asks for; it says what the exit code and the notes say."""
     if not args.html:
         return
-    from adaptfault.evaluation.html_diagnosis import write_diagnosis
+    from adaptfault.evaluation.html_diagnosis import HEADLINES, OF_A_DATA_SET, write_diagnosis
 
     name = ", ".join(args.recordings)
     write_diagnosis(
@@ -107,6 +113,7 @@ def write_page(
         code=code,
         notes=notes,
         count_from=args.count_from,
+        headlines=OF_A_DATA_SET if of_a_data_set else HEADLINES,
     )
 
 
@@ -210,14 +217,22 @@ def _faults(diagnosis: Diagnosis, bundle: Bundle | None) -> tuple[int, str]:
     return 1, f"handled: version {version.number} of {bundle.path} runs without these cells"
 
 
-def text_of(diagnosis: Diagnosis, notes: Sequence[str], count_from: int) -> str:
-    """Return the diagnosis as text, with what would test the other cells, and the notes below."""
+def text_of(
+    diagnosis: Diagnosis,
+    notes: Sequence[str],
+    count_from: int,
+    say: Callable[[str], str] = str,
+) -> str:
+    """Return the diagnosis as text, with what would test the other cells, and the notes below.
+
+    ``say`` calls the pads of a sentence by their names.
+    """
     from diagnostics.decision.numbering import Numbering
 
     numbering = Numbering.from_layout(diagnosis.layout, count_from)
     lines = diagnosis.text(count_from).splitlines()
     advice = diagnosis.coverage.advice[:5]
-    lines += [f"to test more: {numbering.text(touch)}" for touch in advice]
+    lines += [f"to test more: {numbering.text(say(touch))}" for touch in advice]
     if diagnosis.layout.rows > _ROWS:
         lines.append(lines[0])
     return "\n".join([*lines, *map(numbering.text, notes)])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from datetime import datetime
 from functools import partial
 from pathlib import Path
@@ -19,6 +19,12 @@ HEADLINES: dict[Verdict, str] = {
     "call": "Call a technician",
     "watch": "Watch: single cells are faulty",
     "nothing": "Nothing to do",
+}
+
+OF_A_DATA_SET: dict[Verdict, str] = {
+    "call": "Not fit for training as it is",
+    "watch": "Train with care: see what was found",
+    "nothing": "Fit for training, as far as it was tested",
 }
 
 _TESTED = 0.5  # below this share of tested cells, a log without a fault is no proof of health
@@ -51,6 +57,7 @@ def write_diagnosis(
     code: int | None = None,
     notes: Sequence[str] = (),
     count_from: int = 0,
+    headlines: Mapping[Verdict, str] = HEADLINES,
 ) -> Path:
     """Write the page; return its path.
 
@@ -63,12 +70,13 @@ def write_diagnosis(
         notes: sentences below the verdict: a changed sensor, exchanged wires, faults that are
             handled.
         count_from: number of the first pad, row, column and cell on the page.
+        headlines: of each verdict.
 
     Raises:
         OSError: the folder cannot be written.
     """
     state = verdict(diagnosis, code)
-    headline = HEADLINES[state]
+    headline = headlines[state]
     if state == "watch" and diagnosis.faults and code is not None and code < diagnosis.exit_code:
         headline = "Watch: the running version handles the faults"
     elif state == "watch" and not diagnosis.faults:

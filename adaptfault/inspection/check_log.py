@@ -11,9 +11,10 @@ from adaptfault.data.recordings import Opened, Recordings
 from adaptfault.data.recordings.facts.rates import Clock
 from adaptfault.data.recordings.load import PART
 from adaptfault.data.summary import summary_of
-from adaptfault.inspection.codes import Need
+from adaptfault.inspection.code import Need
 from adaptfault.inspection.data_set import DataSetCheck, starts_and_tares
 from adaptfault.inspection.inspection import Inspection
+from adaptfault.inspection.naming import Naming
 from diagnostics.preprocessing.readings import RecordingBlocks
 from diagnostics.sensor.shared import measured
 
@@ -51,8 +52,17 @@ def check_log(
     if log.labels is not None and in_memory:
         given.add("classes")
     begun, tared = starts_and_tares(recordings, log.names, log.layout)
+    naming = Naming.of(log)
     return DataSetCheck(
-        inspection, summary, clock, left_out, begun, tared, frozenset(given), source
+        naming.of_inspection(inspection),
+        summary,
+        clock,
+        left_out,
+        begun,
+        tared,
+        frozenset(given),
+        source,
+        naming,
     )
 
 

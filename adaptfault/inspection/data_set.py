@@ -17,7 +17,7 @@ contact whose readings are cut off at 0, and one where most recordings begin in 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -26,9 +26,12 @@ from numpy.typing import NDArray
 
 from adaptfault.data.recordings.facts.rates import Clock
 from adaptfault.data.summary import Summary
-from adaptfault.inspection.codes import Need, unchecked
+from adaptfault.inspection.code import Need
+from adaptfault.inspection.codes import unchecked
 from adaptfault.inspection.findings import Findings, Unchecked, unchecked_for_want
 from adaptfault.inspection.inspection import Finding, Inspection
+from adaptfault.inspection.leave_out import LeaveOut
+from adaptfault.inspection.naming import Naming
 from adaptfault.inspection.severity import Name, of_finding
 from diagnostics import SensorLayout
 from diagnostics.preprocessing.levels import MAJORITY
@@ -56,6 +59,7 @@ class DataSetCheck:
         begin_in_contact, tared_in_contact: names of such recordings.
         given: what the recordings were compared with.
         source: what the data set is called.
+        naming: of its pads and recordings.
     """
 
     inspection: Inspection
@@ -66,6 +70,7 @@ class DataSetCheck:
     tared_in_contact: tuple[str, ...]
     given: frozenset[Need] = frozenset()
     source: str = ""
+    naming: Naming = field(default_factory=Naming)
 
     @property
     def healthy_share(self) -> float:
@@ -78,7 +83,18 @@ class DataSetCheck:
         """What was found, and what was not checked."""
         told = (Finding(name, of_finding(name), text) for name, text in self._remarked)
         found = (*self.inspection.findings, *told)
-        return Findings(found, self._unchecked, self.layout, self.source)
+        unchecked = tuple(replace(one, what=self.naming.text(one.what)) for one in self._unchecked)
+        return Findings(found, unchecked, self.layout, self.source, self.naming)
+
+    @property
+    def leave_out(self) -> LeaveOut:
+        """Without which recordings and cells no fault that was found is left."""
+        return LeaveOut.of(self.inspection.diagnosis)
+
+    @property
+    def advice(self) -> list[str]:
+        """What to leave out of a training, in sentences."""
+        return [self.naming.text(sentence) for sentence in self.leave_out.sentences]
 
     @property
     def layout(self) -> SensorLayout:
@@ -150,6 +166,7 @@ class DataSetCheck:
             "healthy_share": self.healthy_share,
             "findings": self.findings.to_dicts(),
             "not_checked": [one.to_dict() for one in self.findings.unchecked],
+            "leave_out": self.leave_out.to_dict(self.inspection.diagnosis.by_recording.names),
             "remarks": list(self.remarks),
             "clock": asdict(self.clock),
             "left_out": self.left_out,

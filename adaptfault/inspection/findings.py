@@ -8,11 +8,14 @@ chosen to fail.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Literal, overload
 
-from adaptfault.inspection.codes import CODES, LEVELS, PREFIX, Code, Need, code_of, how_to_give
+from adaptfault.inspection.code import LEVELS, NEEDS, PREFIX, Code, Need
+from adaptfault.inspection.code_list import CODES
+from adaptfault.inspection.codes import code_of
 from adaptfault.inspection.inspection import Finding
+from adaptfault.inspection.naming import Naming
 from adaptfault.inspection.severity import worst
 from diagnostics import SensorLayout
 from diagnostics.decision.numbering import Numbering
@@ -51,12 +54,14 @@ class Findings(Sequence[Finding]):
         unchecked: what was not checked.
         layout: the array.
         source: what was checked, as it was named.
+        naming: of its pads and recordings.
     """
 
     found: tuple[Finding, ...]
     unchecked: tuple[Unchecked, ...]
     layout: SensorLayout
     source: str = ""
+    naming: Naming = field(default_factory=Naming, repr=False)
 
     @overload
     def __getitem__(self, place: int) -> Finding: ...
@@ -104,7 +109,33 @@ class Findings(Sequence[Finding]):
 
     def to_dicts(self) -> list[dict[str, Any]]:
         """Return the findings, JSON-safe."""
-        return [_as_dict(finding) for finding in self.found]
+        return [self._as_dict(finding) for finding in self.found]
+
+    def _as_dict(self, finding: Finding) -> dict[str, Any]:
+        fault = finding.fault
+        about = {**finding.to_dict(), "level": level_of(finding)}
+        if fault is None:
+            return {
+                **about,
+                "kind": None,
+                "cells": [],
+                "pads": [],
+                "recordings": None,
+                "begin": None,
+            }
+        names = self.naming.recordings
+        recordings = None
+        if fault.recordings is not None:
+            recordings = [names[i] if names else str(i) for i in fault.recordings]
+        begin = self.naming.place(fault.onset or 0)
+        return {
+            **about,
+            "kind": str(fault.kind),
+            "cells": list(fault.cells),
+            "pads": self.naming.pads_of(fault.cells, self.layout),
+            "recordings": recordings,
+            "begin": None if begin is None else {"recording": begin[0], "frame": begin[1]},
+        }
 
     def github(self, numbering: Numbering) -> str:
         """Return annotations, as workflow commands of GitHub Actions."""
@@ -176,7 +207,7 @@ def unchecked_for_want(left: Mapping[Need, Iterable[Code]]) -> list[Unchecked]:
     found = []
     for need, codes in left.items():
         names = ", ".join(code.name.replace("_", " ") for code in codes)
-        what = f"{names}: none was looked for without {how_to_give(need)}"
+        what = f"{names}: none was looked for without {NEEDS[need]}"
         found.append(Unchecked(what, tuple(map(str, codes))))
     return found
 
@@ -208,20 +239,6 @@ def _beginning(text: str) -> set[Code]:
     if not begin.startswith(PREFIX):
         return set()
     return {code for code in CODES if str(code).startswith(begin)}
-
-
-def _as_dict(finding: Finding) -> dict[str, Any]:
-    about = {**finding.to_dict(), "level": level_of(finding)}
-    fault = finding.fault
-    if fault is None:
-        return {**about, "kind": None, "cells": [], "recordings": None, "onset": None}
-    return {
-        **about,
-        "kind": str(fault.kind),
-        "cells": list(fault.cells),
-        "recordings": None if fault.recordings is None else list(fault.recordings),
-        "onset": fault.onset,
-    }
 
 
 def _command(level: str, about: Mapping[str, str], message: str) -> str:

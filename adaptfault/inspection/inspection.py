@@ -15,7 +15,8 @@ from adaptfault.inspection.changed_readings import (
     find_changed_readings,
     find_sensor_change,
 )
-from adaptfault.inspection.codes import BY_NAME, Code
+from adaptfault.inspection.code import Code
+from adaptfault.inspection.codes import BY_NAME
 from adaptfault.inspection.coincidence import coinciding
 from adaptfault.inspection.converter_range import within_range
 from adaptfault.inspection.severity import Name, of_faults, of_finding, untested, worst

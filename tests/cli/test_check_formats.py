@@ -12,7 +12,7 @@ import yaml
 
 from adaptfault.cli import main
 from adaptfault.data.recordings import Recordings, save_npz
-from adaptfault.inspection.codes import CODES
+from adaptfault.inspection.code_list import CODES
 from adaptfault.schemas import SCHEMAS, schema_of
 from diagnostics import Fault, SensorLayout, inject
 

@@ -2,7 +2,8 @@
 
 import pytest
 
-from adaptfault.inspection.codes import BY_CODE, CODES, code_of, unchecked
+from adaptfault.inspection.code_list import CODES
+from adaptfault.inspection.codes import BY_CODE, code_of, unchecked
 from adaptfault.inspection.severity import NAMES
 from diagnostics import FaultKind
 

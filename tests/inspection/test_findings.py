@@ -7,7 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from adaptfault.inspection.codes import CODES, LEVELS
+from adaptfault.inspection.code import LEVELS
+from adaptfault.inspection.code_list import CODES
 from adaptfault.inspection.findings import FailOn, Findings, Unchecked, level_of
 from adaptfault.inspection.inspection import Finding
 from adaptfault.inspection.severity import NAMES, of_finding

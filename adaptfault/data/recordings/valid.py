@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 from adaptfault.data.atomic import atomic_file, atomic_folder
 from adaptfault.data.recordings.errors import InputError
 from adaptfault.data.recordings.formats.datasets.extra import imported
-from adaptfault.data.recordings.formats.datasets.features import by_episode
+from adaptfault.data.recordings.formats.datasets.features import common_features
 from adaptfault.data.recordings.recording import Recording
 from diagnostics import Fault, SensorLayout
 
@@ -136,8 +136,7 @@ class _Places:
         self.arrays = [one.arrays for one in origins] if named else []
         every = [name for names in self.arrays for name in names]
         self.are_own = named and len(set(every)) == len(every)
-        common = {tuple(_without_episode(name) for name in names) for names in self.arrays}
-        self.features = common.pop() if len(common) == 1 else ()
+        self.features = common_features(self.arrays)
         numbers = [one.number for one in origins]
         are_numbered = None not in numbers and len(set(numbers)) == len(numbers)
         self._numbers = numbers if are_numbered else []
@@ -166,11 +165,6 @@ class _Places:
     def grid(self, mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """Return a mask as ``[T, pads, rows, cols]``."""
         return mask.reshape(-1, *self.layout.shape)
-
-
-def _without_episode(name: str) -> str:
-    ((common, _),) = by_episode([name]).popitem()[1].items()
-    return common
 
 
 def _npz(path: Path, masks: Masks, names: Sequence[str], places: _Places) -> None:

@@ -93,6 +93,22 @@ def by_episode(names: Sequence[str]) -> dict[str, dict[str, str]]:
     return grouped
 
 
+def common_features(arrays: Sequence[Sequence[str]]) -> tuple[str, ...]:
+    """Return the names that the arrays of all recordings have in common, without those of episodes;
+    empty where there are none.
+
+    Args:
+        arrays: names of the arrays of each recording.
+    """
+    common = {tuple(map(_without_episode, names)) for names in arrays}
+    return common.pop() if len(common) == 1 else ()
+
+
+def _without_episode(name: str) -> str:
+    ((common, _),) = by_episode([name]).popitem()[1].items()
+    return common
+
+
 def is_touch(name: str) -> bool:
     """Return whether a feature holds touch by its name."""
     return _TOUCH.search(name) is not None and _NO_TOUCH.search(name) is None

@@ -48,6 +48,11 @@ class Check(Inspecting):
     write_valid: WrittenRecordings | None = option(
         "write which readings are valid: .npz, .parquet, .zarr or .h5", "FILE"
     )
+    write_copy: WrittenRecordings | None = option(
+        "write a copy of a LeRobot data set, a Parquet or HDF5 file or a Zarr store, with which of"
+        " its readings are valid; the statistics of LeRobot are then those of valid readings",
+        "PATH",
+    )
     count_from: int = count_from_option()
     no_cache: bool = cache_option()
     untested_code: int = untested_code_option()
@@ -74,6 +79,13 @@ class Check(Inspecting):
             from adaptfault.data.recordings.valid import refuse_foreign
 
             refuse_foreign(self.write_valid)
+        if self.write_copy:
+            from adaptfault.data.recordings.valid_copy import writer_of
+
+            if len(self.recordings) > 1:
+                given = len(self.recordings)
+                raise ValueError(f"--write-copy takes one data set, got {given}: check each alone")
+            writer_of(self.write_copy, self.recordings[0])
         part = None if self.healthy is None else partial(_part, self.healthy)
         inspected = inspect_log(self, part)
         log = inspected.log
@@ -156,3 +168,9 @@ def _write(args: Check, log: Opened, checked: DataSetCheck, code: int, notes: li
 
         masks = valid_masks(iter(log), diagnosis.faults, log.layout)
         write_valid(args.write_valid, masks, log.names, log.layout, log.origins)
+    if args.write_copy:
+        from adaptfault.data.recordings.valid import valid_masks
+        from adaptfault.data.recordings.valid_copy import write_copy
+
+        masks = valid_masks(iter(log), diagnosis.faults, log.layout)
+        write_copy(args.write_copy, args.recordings[0], masks, log.layout, log.origins)

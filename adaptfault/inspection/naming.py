@@ -10,19 +10,23 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import accumulate
-from typing import Any
+from typing import TypeVar
 
 from adaptfault.data.printable import printable
 from adaptfault.data.recordings import Opened, Recordings
 from adaptfault.data.recordings.formats.datasets.features import common_features
 from adaptfault.inspection.inspection import Finding, Inspection
 from diagnostics import Diagnosis, Fault, SensorLayout
+from diagnostics.decision.static_loads import StaticLoad
+from diagnostics.preprocessing.transport import TransportFault
 
 _PAD = re.compile(r"\bpad (\d+)\b")
 _NUMBERS = r"\d+(?: to \d+)?(?:, \d+(?: to \d+)?)*"
 _RECORDINGS = re.compile(rf"\brecording(s?) ({_NUMBERS})(?! (?:frame|reading))\b")
 _NUMBERED = re.compile(r"(?P<word>[^\W\d_]+) (?P<number>\d+)")
 _DIVIDED = re.compile(r"[./]")
+
+OfFrames = TypeVar("OfFrames", StaticLoad, TransportFault)
 
 
 @dataclass(frozen=True)
@@ -91,9 +95,7 @@ class Naming:
         if diagnosis.n_recordings != len(self.recordings):
             return inspection
         named = self._of_diagnosis(diagnosis)
-        before = [*diagnosis.faults, *diagnosis.static_loads, *diagnosis.transport]
-        after = [*named.faults, *named.static_loads, *named.transport]
-        told = {old.reason: new.reason for old, new in zip(before, after, strict=True)}
+        told = dict(zip(_reasons(diagnosis), _reasons(named), strict=True))
         findings = tuple(self._finding(one, told) for one in inspection.findings)
         readings = replace(inspection.readings, diagnosis=named)
         return replace(inspection, readings=readings, findings=findings)
@@ -104,8 +106,8 @@ class Naming:
             names=self.recordings,
             faults=tuple(map(self._fault, diagnosis.faults)),
             possible=tuple(map(self._fault, diagnosis.possible)),
-            static_loads=tuple(map(self._at_onset, diagnosis.static_loads)),
-            transport=tuple(map(self._at_onset, diagnosis.transport)),
+            static_loads=tuple(self._at_onset(load) for load in diagnosis.static_loads),
+            transport=tuple(self._at_onset(one) for one in diagnosis.transport),
         )
 
     def _finding(self, finding: Finding, told: dict[str, str]) -> Finding:
@@ -117,10 +119,10 @@ class Naming:
 
     def _fault(self, fault: Fault) -> Fault:
         alternatives = tuple(map(self.text, fault.alternatives))
-        return replace(self._at_onset(fault), alternatives=alternatives)
+        reason = self.told(fault.reason, fault.onset)
+        return replace(fault, reason=reason, alternatives=alternatives)
 
-    def _at_onset(self, one: Any) -> Any:
-        """Return a fault, an object or a fault of frames with its sentence by the names."""
+    def _at_onset(self, one: OfFrames) -> OfFrames:
         return replace(one, reason=self.told(one.reason, one.onset))
 
     def _pad(self, found: re.Match[str]) -> str:
@@ -141,6 +143,13 @@ class Naming:
     @staticmethod
     def _renamed(numbers: str, names: Sequence[str]) -> str:
         return re.sub(r"\d+", lambda number: names[int(number[0])], numbers)
+
+
+def _reasons(diagnosis: Diagnosis) -> list[str]:
+    """Return the sentences of a diagnosis that are findings."""
+    faults = [one.reason for one in diagnosis.faults]
+    loads = [one.reason for one in diagnosis.static_loads]
+    return [*faults, *loads, *(one.reason for one in diagnosis.transport)]
 
 
 def _apart(features: Sequence[str]) -> tuple[str, ...]:

@@ -27,6 +27,8 @@ NO_PATHS = {
     *("key", "topic", "field", "columns", "ignore", "time_column", "label_column", "unit", "shape"),
     *(
         "device",
+        "fail_on",
+        "code",
         "inject",
         "name",
         "healthy",

@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 from adaptfault.data.atomic import atomic_file, atomic_folder
 from adaptfault.data.recordings.errors import InputError
 from adaptfault.data.recordings.formats.datasets.extra import imported
-from adaptfault.data.recordings.formats.datasets.features import common_features
+from adaptfault.data.recordings.formats.datasets.features import VALID, common_features
 from adaptfault.data.recordings.recording import Recording
 from diagnostics import Fault, SensorLayout
 
@@ -88,7 +88,7 @@ def write_valid(
         what = f"expected a name that ends in {', '.join(_WRITERS)}"
         raise InputError.at(path, what)
     refuse_foreign(path)
-    writer(path, masks, names, _Places(origins, layout))
+    writer(path, masks, names, Places(origins, layout))
 
 
 def refuse_foreign(path: str | PathLike[str]) -> None:
@@ -114,7 +114,7 @@ def _is_ours(path: Path) -> bool:
     return about.get("schema") == _SCHEMA and names <= held
 
 
-class _Places:
+class Places:
     """How the masks of recordings are called: as the arrays that hold the readings, where these
     have names.
 
@@ -140,6 +140,16 @@ class _Places:
         numbers = [one.number for one in origins]
         are_numbered = None not in numbers and len(set(numbers)) == len(numbers)
         self._numbers = numbers if are_numbered else []
+        self._of_number = set(self._numbers)
+
+    @property
+    def sizes(self) -> tuple[tuple[int, ...], ...]:
+        """Of a frame in each array."""
+        return self._origins[0].facts.sizes
+
+    def is_read(self, number: int) -> bool:
+        """Return whether a recording has this number."""
+        return number in self._of_number
 
     def number(self, i: int) -> int:
         """Return the number of a recording in its data set, else its place."""
@@ -167,7 +177,7 @@ class _Places:
         return mask.reshape(-1, *self.layout.shape)
 
 
-def _npz(path: Path, masks: Masks, names: Sequence[str], places: _Places) -> None:
+def _npz(path: Path, masks: Masks, names: Sequence[str], places: Places) -> None:
     every = list(masks)
     lengths = np.array([len(mask) for mask in every])
     padded = np.zeros((len(every), int(lengths.max()), places.layout.n_cells), dtype=bool)
@@ -182,7 +192,7 @@ def _npz(path: Path, masks: Masks, names: Sequence[str], places: _Places) -> Non
         )
 
 
-def _parquet(path: Path, masks: Masks, names: Sequence[str], places: _Places) -> None:
+def _parquet(path: Path, masks: Masks, names: Sequence[str], places: Places) -> None:
     pa = imported("pyarrow", path)
     parquet = imported("pyarrow.parquet", path)
     features = places.features or [f"observation.tactile.{p}" for p in range(places.layout.pads)]
@@ -200,7 +210,7 @@ def _parquet(path: Path, masks: Masks, names: Sequence[str], places: _Places) ->
                 "index": pa.array(frames + places.rows(i, before)),
             }
             for name, part in zip(features, parts, strict=True):
-                columns[f"{name}.valid"] = _lists(pa, part)
+                columns[f"{name}{VALID}"] = column_of(pa, part)
             table = pa.table(columns)
             writer = writer or parquet.ParquetWriter(place, table.schema)
             writer.write_table(table)
@@ -209,7 +219,7 @@ def _parquet(path: Path, masks: Masks, names: Sequence[str], places: _Places) ->
             writer.close()
 
 
-def _lists(pa: Any, mask: NDArray[np.bool_]) -> Any:
+def column_of(pa: Any, mask: NDArray[np.bool_]) -> Any:
     """Return a mask ``[T, ...]`` as a column of lists."""
     column = pa.array(mask.ravel())
     sizes = mask.shape[1:]
@@ -218,21 +228,21 @@ def _lists(pa: Any, mask: NDArray[np.bool_]) -> Any:
     return column
 
 
-def _zarr(path: Path, masks: Masks, names: Sequence[str], places: _Places) -> None:
+def _zarr(path: Path, masks: Masks, names: Sequence[str], places: Places) -> None:
     zarr = imported("zarr", path)
     arrays: dict[str, NDArray[Any]] = {}
     are_joined = len(set(places.arrays)) == 1
     if places.are_own and not are_joined:
         for i, mask in enumerate(masks):
             for name, part in zip(places.arrays[i], places.parts(i, mask), strict=True):
-                arrays[f"{name}.valid"] = part
+                arrays[f"{name}{VALID}"] = part
     else:
         every = list(masks)
         arrays["meta/episode_ends"] = np.cumsum([len(mask) for mask in every])
         if are_joined:
             by_array = zip(*(places.parts(i, mask) for i, mask in enumerate(every)), strict=True)
             for name, parts in zip(places.arrays[0], by_array, strict=True):
-                arrays[f"{name}.valid"] = np.concatenate(parts)
+                arrays[f"{name}{VALID}"] = np.concatenate(parts)
         else:
             arrays["data/valid"] = places.grid(np.concatenate(every))
     with atomic_folder(path, replaces=_is_ours(path)) as place:
@@ -243,13 +253,13 @@ def _zarr(path: Path, masks: Masks, names: Sequence[str], places: _Places) -> No
             root.create_array(name, data=values)
 
 
-def _hdf5(path: Path, masks: Masks, names: Sequence[str], places: _Places) -> None:
+def _hdf5(path: Path, masks: Masks, names: Sequence[str], places: Places) -> None:
     h5py = imported("h5py", path)
     with atomic_file(path) as place, h5py.File(place, "w") as file:
         for i, (mask, name) in enumerate(zip(masks, names, strict=True)):
             if places.are_own:
                 for array, part in zip(places.arrays[i], places.parts(i, mask), strict=True):
-                    held = file.create_dataset(f"{array}.valid", data=part, compression="gzip")
+                    held = file.create_dataset(f"{array}{VALID}", data=part, compression="gzip")
                     held.parent.attrs["name"] = name
                 continue
             group = file.create_group(f"episode_{places.number(i)}")
@@ -258,10 +268,10 @@ def _hdf5(path: Path, masks: Masks, names: Sequence[str], places: _Places) -> No
                 group.create_dataset("valid", data=places.grid(mask), compression="gzip")
                 continue
             for array, part in zip(places.arrays[i], places.parts(i, mask), strict=True):
-                group.create_dataset(f"{array}.valid", data=part, compression="gzip")
+                group.create_dataset(f"{array}{VALID}", data=part, compression="gzip")
 
 
-_WRITERS: Mapping[str, Callable[[Path, Masks, Sequence[str], _Places], None]] = {
+_WRITERS: Mapping[str, Callable[[Path, Masks, Sequence[str], Places], None]] = {
     ".npz": _npz,
     ".parquet": _parquet,
     ".zarr": _zarr,

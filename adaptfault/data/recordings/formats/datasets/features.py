@@ -25,6 +25,9 @@ from adaptfault.data.recordings.facts.labels import natural_key
 from adaptfault.data.recordings.facts.roles import readings
 from adaptfault.data.recordings.recording import Shape
 
+VALID = ".valid"
+"""What the name of a mask has behind that of the array whose valid readings it tells."""
+
 _TOUCH = re.compile(r"tactile|taxel|pressure|touch|skin|fsr", re.IGNORECASE)
 _NO_TOUCH = re.compile(
     r"temp|time|stamp|valid|mask|index|image|rgb|depth|video|calib", re.IGNORECASE

@@ -51,6 +51,7 @@ if TYPE_CHECKING:
     from adaptfault.models.network import TactileTransformer
     from adaptfault.models.store import load_model, save_model
     from adaptfault.models.training import train
+    from adaptfault.models.valid_touch import ValidTouch
     from adaptfault.models.value_units import ValueUnits
     from adaptfault.prediction.export import add_onnx
     from adaptfault.prediction.inference import Inference
@@ -94,6 +95,7 @@ __all__ = [
     "Summary",
     "TactileTransformer",
     "Untrusted",
+    "ValidTouch",
     "ValueScores",
     "ValueUnits",
     "Windows",
@@ -165,6 +167,7 @@ _HOMES = {
     "TactileTransformer": "models.network",
     "Untrusted": "bundle.versions",
     "ValueScores": "evaluation.scores",
+    "ValidTouch": "models.valid_touch",
     "ValueUnits": "models.value_units",
     "Windows": "data.windows",
     "WorstFaults": "adaptation.worst",

@@ -42,6 +42,11 @@ class Check(Inspecting):
         "recordings of the data set that are known to be healthy, as 0:20 for the first 20",
         "FIRST:LAST",
     )
+    groups: Read | None = option(
+        "what else divides the recordings, with which a fault may coincide: CSV table with the"
+        " columns recording (its name) and one for each, as robot, session, day",
+        "TABLE",
+    )
     out: Written | None = option("write the result as JSON", "FILE")
     html: Written | None = option("write a page", "FILE")
     badge: Written | None = option("write a badge as SVG", "FILE")
@@ -72,6 +77,7 @@ class Check(Inspecting):
         """Check a data set; the exit code says how bad it is."""
         from adaptfault.inspection.check_log import check_log
         from adaptfault.inspection.findings import FailOn
+        from adaptfault.inspection.groupings import coincide, data_sets_of, read_groupings
         from adaptfault.inspection.naming import Naming
 
         fails = None if self.fail_on is None else FailOn.parse(self.fail_on)
@@ -90,7 +96,13 @@ class Check(Inspecting):
         inspected = inspect_log(self, part)
         log = inspected.log
         report_range(log)
-        named = Naming.of(log).of_inspection(inspected.inspection)
+        groupings = dict(data_sets_of(log, self.recordings))
+        if self.groups is not None:
+            groupings |= read_groupings(self.groups, log.names)
+        found = inspected.inspection
+        also = coincide(found.diagnosis, groupings)
+        found = replace(found, findings=(*found.findings, *also))
+        named = Naming.of(log).of_inspection(found)
         inspected = replace(inspected, inspection=named)
         judged = replace(named, findings=inspected.judged(self.untested_code))
         checked = check_log(
@@ -98,6 +110,7 @@ class Check(Inspecting):
             judged,
             left_out=self.left_out,
             compared=bool(self.reference or self.healthy),
+            grouped=bool(groupings),
             source=", ".join(self.recordings),
         )
         code = checked.severity if fails is None else checked.findings.failed(fails)

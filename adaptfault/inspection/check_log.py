@@ -25,6 +25,7 @@ def check_log(
     *,
     left_out: int = 0,
     compared: bool = False,
+    grouped: bool = False,
     source: str = "",
 ) -> DataSetCheck:
     """Return the health of a data set, from an inspection of it.
@@ -34,6 +35,7 @@ def check_log(
         inspection: of its recordings, with their classes.
         left_out: recordings and files that could not be read.
         compared: whether the inspection had healthy recordings to compare with.
+        grouped: whether anything else than classes divides the recordings.
         source: what the data set is called.
     """
 
@@ -49,7 +51,7 @@ def check_log(
     if clock.jitter is not None:
         given.add("times")
     in_memory = int(summary.lengths.sum()) * log.layout.n_cells <= PART
-    if log.labels is not None and in_memory:
+    if (log.labels is not None or grouped) and in_memory:
         given.add("classes")
     begun, tared = starts_and_tares(recordings, log.names, log.layout)
     naming = Naming.of(log)

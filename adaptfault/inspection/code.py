@@ -104,7 +104,7 @@ _NAME_OF: Mapping[str, Name] = {name: name for name in get_args(Name)}
 
 NEEDS: Mapping[Need, str] = {
     "reference": "healthy recordings: --reference FILE, or --healthy FIRST:LAST",
-    "classes": "recordings with classes: tasks of the data set, --labels, --label-column",
+    "classes": "recordings with classes or groups: tasks, --labels, --label-column, --groups",
     "times": "times of the frames: --time-column",
 }
 """The options that give it."""

@@ -357,8 +357,8 @@ CODES: tuple[Code, ...] = (
     Code(
         160,
         "coincides",
-        "A fault separates classes: it shows in nearly all recordings of some and in hardly any"
-        " other.",
+        "A fault separates classes, or robots, sessions, data sets: it shows in nearly all"
+        " recordings of some and in hardly any other.",
         "A model learns the fault for the class, and its validation shows nothing.",
         "Of a data set that is inspected part by part it is not looked for.",
         "A fault that shows in a part of a class.",

@@ -14,12 +14,13 @@ from diagnostics.preprocessing.levels import DOUBTED, LEAST_LOADED
 _LISTED = 5
 
 
-def coinciding(diagnosis: Diagnosis, classes: ArrayLike) -> list[str]:
+def coinciding(diagnosis: Diagnosis, classes: ArrayLike, what: str = "class") -> list[str]:
     """Return a sentence for each set of classes that faults separate from the others.
 
     Args:
         diagnosis: of a log, by recording.
         classes: name or number of the class of each recording, ``[n]``.
+        what: they are, as "session".
     """
     label = np.asarray(classes)
     if diagnosis.states is None or len(label) != len(diagnosis.states):
@@ -30,7 +31,7 @@ def coinciding(diagnosis: Diagnosis, classes: ArrayLike) -> list[str]:
         separated = _separated(shown, label)
         if separated:
             of.setdefault(separated, []).append(fault)
-    return [_sentence(names, faults, diagnosis.layout) for names, faults in of.items()]
+    return [_sentence(names, faults, diagnosis.layout, what) for names, faults in of.items()]
 
 
 def _separated(shown: NDArray[np.bool_], label: NDArray[np.generic]) -> tuple[str, ...]:
@@ -44,13 +45,17 @@ def _separated(shown: NDArray[np.bool_], label: NDArray[np.generic]) -> tuple[st
     return tuple(map(str, names[whole].tolist()))
 
 
-def _sentence(names: Sequence[str], faults: Sequence[Fault], layout: SensorLayout) -> str:
+def _sentence(
+    names: Sequence[str], faults: Sequence[Fault], layout: SensorLayout, what: str
+) -> str:
     places = [str(one.line) if one.line else layout.place(one.cells[0]) for one in faults]
     more = f" and {len(places) - _LISTED} more" if len(places) > _LISTED else ""
-    several = "classes" if len(names) > 1 else "class"
+    several = what
+    if len(names) > 1:
+        several += "es" if what.endswith("s") else "s"
     verb = "coincide" if len(places) > 1 else "coincides"
     return (
         f"{'; '.join(places[:_LISTED])}{more} {verb} with {several} {', '.join(names)} and no"
-        " other: a model may learn the fault for the class; leave out these cells, or these"
+        f" other: a model may learn the fault for the {what}; leave out these cells, or these"
         " recordings"
     )

@@ -51,7 +51,11 @@ class Naming:
             return cls((), log.names, tuple(map(len, log.frames)))
         features = common_features([one.arrays for one in log.origins])
         pads = _apart(features) if len(features) == log.layout.pads else ()
-        return cls(pads, log.names, tuple(log.lengths))
+        names = log.names
+        if len(set(names)) < len(names):  # of several data sets
+            sources = [one.facts.path.name for one in log.origins]
+            names = tuple(map("/".join, zip(sources, names, strict=True)))
+        return cls(pads, names, tuple(log.lengths))
 
     def place(self, frame: int) -> tuple[str, int] | None:
         """Return the recording that holds a frame of all, and its number there; None: none does."""

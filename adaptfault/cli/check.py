@@ -128,9 +128,9 @@ class Check(Inspecting):
         findings = checked.findings
         numbering = Numbering.from_layout(checked.layout, self.count_from)
         if self.format == "github":
-            text = findings.github(numbering)
+            text = findings.github(numbering, checked.advice)
         elif self.format == "markdown":
-            text = findings.markdown(numbering)
+            text = findings.markdown(numbering, checked.advice)
         else:
             say = checked.naming.text
             told = text_of(checked.inspection.diagnosis, notes, self.count_from, say)

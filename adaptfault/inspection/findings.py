@@ -137,17 +137,21 @@ class Findings(Sequence[Finding]):
             "begin": None if begin is None else {"recording": begin[0], "frame": begin[1]},
         }
 
-    def github(self, numbering: Numbering) -> str:
-        """Return annotations, as workflow commands of GitHub Actions."""
+    def github(self, numbering: Numbering, advice: Sequence[str] = ()) -> str:
+        """Return annotations, as workflow commands of GitHub Actions; ``advice``: what to leave
+        out."""
         lines = []
         for one in self.found:
             about = {"title": f"{one.code} {one.code.name}", "file": self.source}
             lines.append(_command(level_of(one), about, numbering.text(one.reason)))
-        lines += [_command("notice", {"title": "not checked"}, u.what) for u in self.unchecked]
+        beside = [("leave out", text) for text in advice]
+        beside += [("not checked", one.what) for one in self.unchecked]
+        for title, text in beside:
+            lines.append(_command("notice", {"title": title}, numbering.text(text)))
         return "\n".join(lines)
 
-    def markdown(self, numbering: Numbering) -> str:
-        """Return a section for a data-set card."""
+    def markdown(self, numbering: Numbering, advice: Sequence[str] = ()) -> str:
+        """Return a section for a data-set card; ``advice``: what to leave out."""
         lines = ["## Touch health", "", f"{self.layout}; {self.summary()}.", ""]
         if self.found:
             lines += ["| code | level | finding |", "|---|---|---|"]
@@ -156,10 +160,10 @@ class Findings(Sequence[Finding]):
                 for one in self.found
             ]
             lines.append("")
-        if self.unchecked:
-            lines += ["Not checked:", ""]
-            lines += [f"- {one.what}" for one in self.unchecked]
-            lines.append("")
+        lists = {"To leave out": advice, "Not checked": [one.what for one in self.unchecked]}
+        for title, texts in lists.items():
+            if texts:
+                lines += [f"{title}:", "", *(f"- {numbering.text(text)}" for text in texts), ""]
         lines.append("`adaptfault explain CODE` says what a code means.")
         return "\n".join(lines)
 
@@ -208,6 +212,8 @@ def unchecked_for_want(left: Mapping[Need, Iterable[Code]]) -> list[Unchecked]:
     for need, codes in left.items():
         names = ", ".join(code.name.replace("_", " ") for code in codes)
         what = f"{names}: none was looked for without {NEEDS[need]}"
+        if need == "reference":
+            what += "; the data set is its own reference"
         found.append(Unchecked(what, tuple(map(str, codes))))
     return found
 

@@ -73,6 +73,9 @@ def test_each_form_tells_the_same_findings(data_set, capsys):
     assert "TOUCH-102 pad 1, row 2, column 4 is short" in said["text"]
     assert said["github"].startswith("::warning title=TOUCH-102 short,file=")
     assert "| TOUCH-102 | warning | pad 1, row 2, column 4 is short" in said["markdown"]
+    for form in ("text", "github", "markdown"):
+        assert "1 cell is faulty in every recording: train without its readings" in said[form]
+        assert "the data set is its own reference" in said[form]
 
 
 @pytest.mark.parametrize(

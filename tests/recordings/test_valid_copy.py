@@ -168,6 +168,19 @@ def test_an_episode_that_was_not_read_is_not_valid(tmp_path):
         assert (got == expected).all()
 
 
+@pytest.mark.parametrize(
+    "path", ["data/chunk-000/file-001.parquet", "meta/stats.json", "meta/episodes_stats.jsonl"]
+)
+def test_a_damaged_file_of_the_data_set_is_named_and_no_copy_is_left(path, tmp_path):
+    source = lerobot(tmp_path / "set")
+    log = open_recordings(source)
+    masks = list(valid_masks(iter(log), [], log.layout))
+    (source / path).write_bytes(b"PAR1 {")
+    with pytest.raises(ValueError, match=rf"{path.rpartition('/')[2]}: (is no|cannot be read)"):
+        write_copy(tmp_path / "copy", source, iter(masks), log.layout, log.origins)
+    assert [one.name for one in tmp_path.iterdir()] == ["set"]
+
+
 def test_windows_of_a_faster_stream_keep_their_shape(tmp_path):
     (tmp_path / "set/meta").mkdir(parents=True)
     (tmp_path / "set/data").mkdir()

@@ -23,6 +23,7 @@ _EPISODE = "episode_index"
 _INFO = "meta/info.json"
 _STATS = "meta/stats.json"
 _EPISODE_LINES = "meta/episodes_stats.jsonl"  # version 2.1
+_NO_JSON = "is no JSON of statistics; write them again, or leave the file out"
 
 Of = dict[str, Statistics]  # by feature
 
@@ -68,6 +69,22 @@ def write_table(
         rows: which readings are valid.
         of_all, of_each: statistics that take in the readings, of all and of each episode.
     """
+    try:
+        _write_groups(place, source, rows, of_all, of_each)
+    except InputError:
+        raise
+    # a damaged file raises any of pyarrow's kinds
+    except Exception as error:
+        raise InputError.unexpected(source, error) from None
+
+
+def _write_groups(
+    place: Path,
+    source: Path,
+    rows: ValidRows,
+    of_all: Of | None,
+    of_each: dict[int, Of] | None,
+) -> None:
     pa = imported("pyarrow", source)
     parquet = imported("pyarrow.parquet", source)
     with parquet.ParquetFile(source) as file:
@@ -151,7 +168,7 @@ def _write_stats(place: Path, of_all: Of) -> None:
     try:
         told = json.loads(path.read_text("utf-8"))
     except ValueError:
-        raise InputError.at(path, "is no JSON; write the statistics again") from None
+        raise InputError.at(path, _NO_JSON) from None
     path.write_text(json.dumps(_told(told, of_all), indent=4), "utf-8")
 
 
@@ -172,9 +189,13 @@ def _write_episodes(place: Path, of_each: dict[int, Of]) -> None:
     if lines.is_file():
         written = []
         for line in lines.read_text("utf-8").splitlines():
-            about = json.loads(line)
-            held = of_each.get(about[_EPISODE], {})
-            written.append(json.dumps({**about, "stats": _told(about["stats"], held)}))
+            try:
+                about = json.loads(line)
+                held = of_each.get(about[_EPISODE], {})
+                stats = _told(about["stats"], held)
+            except (ValueError, KeyError, TypeError):
+                raise InputError.at(lines, _NO_JSON) from None
+            written.append(json.dumps({**about, "stats": stats}))
         lines.write_text("\n".join(written) + "\n", "utf-8")
     for path in sorted((place / "meta/episodes").glob("**/*.parquet")):
         _write_episode_table(path, of_each)

@@ -390,6 +390,15 @@ CODES: tuple[Code, ...] = (
         method="adaptfault.inspection.data_set",
     ),
     Code(
+        164,
+        "held_value",
+        "Cells hold one value away from rest all through several recordings, while those beside"
+        " them move.",
+        "They are dead there, or something lies on them: a model learns it for what goes along.",
+        "No proof of a fault: the cells count as not tested.",
+        method="adaptfault.inspection.held_values",
+    ),
+    Code(
         190,
         "untested",
         "So few cells were tested that faults may be hidden, or none of a pad.",

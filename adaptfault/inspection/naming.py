@@ -158,8 +158,8 @@ def _reasons(diagnosis: Diagnosis) -> list[str]:
 
 def _apart(features: Sequence[str]) -> tuple[str, ...]:
     """Return the parts of names that tell them apart: left and right of
-    ``observation.tactile.left`` and ``observation.tactile.right``; whole names where that leaves a
-    bare number, or nothing."""
+    ``observation.tactile.left`` and ``observation.tactile.right``, of one name its last part; whole
+    names where that leaves a bare number, or nothing."""
     parts = [_DIVIDED.split(name.strip("/")) for name in features]
     while len(features) > 1 and all(len(one) > 1 for one in parts):
         if len({one[0] for one in parts}) == 1:
@@ -168,7 +168,9 @@ def _apart(features: Sequence[str]) -> tuple[str, ...]:
             parts = [one[:-1] for one in parts]
         else:
             break
+    if len(features) == 1:
+        parts = [parts[0][-1:]]
     short = [".".join(one) for one in parts]
-    if len(features) < 2 or not all(name and not name.isdigit() for name in short):
+    if not all(name and not name.isdigit() for name in short):
         short = list(features)
     return tuple(" ".join(printable(name).split()) for name in short)

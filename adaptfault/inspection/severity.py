@@ -48,6 +48,7 @@ Name = Literal[
     "jitter",
     "begins_in_contact",
     "tared_in_contact",
+    "held_value",
 ]
 NAMES: tuple[str, ...] = get_args(Name)
 """Names of findings; they never change, because programs ask for them."""

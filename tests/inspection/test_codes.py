@@ -53,6 +53,7 @@ FROZEN = {
     161: "static_load",
     162: "begins_in_contact",
     163: "tared_in_contact",
+    164: "held_value",
     190: "untested",
     191: "unread",
 }

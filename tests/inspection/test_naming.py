@@ -89,6 +89,8 @@ def test_an_inspection_and_its_diagnosis_tell_the_same():
         (["tactile.left.raw", "tactile.right.raw"], ("left", "right")),
         (["tactile.left.a.raw", "tactile.right.b.raw"], ("left.a", "right.b")),
         (["tactile.0", "tactile.1"], ("tactile.0", "tactile.1")),
+        (["observation.tactile.left"], ("left",)),
+        (["observation.tactile.0"], ("observation.tactile.0",)),
     ],
 )
 def test_pads_are_called_after_what_tells_their_features_apart(features, pads, tmp_path):

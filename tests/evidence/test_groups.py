@@ -5,15 +5,20 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from conftest import without_calibration
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from adaptfault.inspection.inspection import inspect
-from diagnostics import Diagnosis, FaultKind, Line, SelfDiagnosis, SensorLayout
+from diagnostics import Diagnosis, FaultKind, Line, SelfDiagnosis, SensorLayout, Verdict
 
 FINGERS = 4
 CELLS = 6
 FRAMES = 60
 FAILS = 22  # first frame of a recording in which a finger fails
 LAYOUT = SensorLayout(FINGERS, 2, 3, full_scale=255, unit="count", rate=50.0, wiring="bus")
+N_RECORDINGS = 30
+LONG = 32  # frames of a failure that even one recording shows
+WAYS = ("blinks", "low", "high", "middle", "floats", "freezes")
 PLACES = np.array([(row, column) for row in range(2) for column in range(3)], float)
 
 
@@ -59,23 +64,29 @@ def failing(way: str, readings: np.ndarray, rng: np.random.Generator) -> np.ndar
     return np.repeat(one[way][:, None], CELLS, axis=1)
 
 
-def diagnosed(fitted: SelfDiagnosis, way: str, finger: int, which: list[int]) -> Diagnosis:
-    """Return the diagnosis of 30 recordings, in some of which a finger fails."""
+def diagnosed(
+    fitted: SelfDiagnosis,
+    way: str,
+    finger: int,
+    which: list[int],
+    frames: slice = slice(FAILS, None),
+) -> Diagnosis:
+    """Return the diagnosis of a log, in some recordings of which a finger fails for some frames."""
     rng = np.random.default_rng(3)
-    log = recordings(30, 2)
+    log = recordings(N_RECORDINGS, 2)
     cells = slice(CELLS * finger, CELLS * (finger + 1))
     for i in which:
-        log[i][FAILS:, cells] = failing(way, log[i][FAILS:, cells], rng)
+        log[i][frames, cells] = failing(way, log[i][frames, cells], rng)
     return fitted.diagnose(log)
 
 
 def test_fingers_that_are_loaded_independently_are_tested_by_their_own_cells(fitted):
-    found = fitted.diagnose(recordings(30, 2))
+    found = fitted.diagnose(recordings(N_RECORDINGS, 2))
     assert found.faults == ()
     assert found.tested.mean() > 0.9
 
 
-@pytest.mark.parametrize("way", ["blinks", "low", "high", "middle", "floats", "freezes"])
+@pytest.mark.parametrize("way", WAYS)
 def test_a_finger_that_fails_now_and_then_is_one_cause_with_its_first_frame(fitted, way: str):
     finger = 2
     (fault,) = diagnosed(fitted, way, finger, list(range(3, 30, 3))).faults
@@ -93,12 +104,30 @@ def test_any_finger_that_blinks_from_some_recording_on_is_one_cause(fitted, fing
     assert fault.onset == pytest.approx(18 * FRAMES + FAILS, abs=2)
 
 
+@settings(max_examples=25, deadline=None)
+@given(
+    way=st.sampled_from(WAYS),
+    finger=st.integers(0, FINGERS - 1),
+    which=st.just([N_RECORDINGS - 1])
+    | st.lists(st.integers(0, N_RECORDINGS - 1), min_size=1, unique=True),
+    begin=st.integers(0, FRAMES - LONG),
+    length=st.integers(LONG, FRAMES),
+)
+def test_a_finger_that_fails_anywhere_in_the_log_in_any_way_is_never_told_alive(
+    fitted, way: str, finger: int, which: list[int], begin: int, length: int
+):
+    found = diagnosed(fitted, way, finger, which, slice(begin, begin + length))
+    own = slice(CELLS * finger, CELLS * (finger + 1))
+    assert not (found.verdicts[own] == Verdict.ALIVE).any()
+    assert set(found.fault_set) <= set(range(own.start, own.stop))
+
+
 @pytest.mark.parametrize("way", ["blinks", "high"])
 def test_a_finger_that_fails_in_all_recordings_is_told_once_and_nothing_of_the_whole_sensor(
     fitted, way: str
 ):
     rng = np.random.default_rng(3)
-    log = recordings(30, 2)
+    log = recordings(N_RECORDINGS, 2)
     for frames in log:
         frames[FAILS:45, 12:18] = failing(way, frames[FAILS:45, 12:18], rng)
     found = inspect(log, fitted, reference=recordings(60, 1))
@@ -107,7 +136,7 @@ def test_a_finger_that_fails_in_all_recordings_is_told_once_and_nothing_of_the_w
 
 
 def test_a_finger_that_a_flat_object_presses_beyond_the_range_is_healthy(fitted):
-    log = recordings(30, 2)
+    log = recordings(N_RECORDINGS, 2)
     rise = np.minimum(1, np.arange(FRAMES) / 20) * np.minimum(1, np.arange(FRAMES)[::-1] / 20)
     edge = np.array([0.8, 1.0, 0.9, 1.2, 1.1, 0.85])
     for i in range(0, 30, 3):
@@ -118,7 +147,7 @@ def test_a_finger_that_a_flat_object_presses_beyond_the_range_is_healthy(fitted)
 
 @pytest.mark.parametrize("gain", [3, 5])
 def test_the_noise_of_cells_with_a_higher_gain_is_no_load_of_their_finger(fitted, gain: float):
-    log = recordings(30, 2)
+    log = recordings(N_RECORDINGS, 2)
     for frames in log:
         frames[:, [8, 15]] = np.clip(np.rint(gain * frames[:, [8, 15]]), 0, 255)
     faults = fitted.diagnose(log).faults
@@ -128,7 +157,7 @@ def test_the_noise_of_cells_with_a_higher_gain_is_no_load_of_their_finger(fitted
 @pytest.mark.parametrize("gain", [0.03, 0.1, 0.2, 0.35])
 def test_worn_cells_are_weak_with_their_gain_and_no_pad_is_replaced(fitted, gain: float):
     rng = np.random.default_rng(0)
-    log = recordings(30, 2)
+    log = recordings(N_RECORDINGS, 2)
     worn = [8, 15]
     for frames in log:
         weaker = gain * frames[:, worn] + rng.normal(0, 1, (FRAMES, 2))

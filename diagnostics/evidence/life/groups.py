@@ -42,7 +42,6 @@ if TYPE_CHECKING:
     from diagnostics.wiring import LineKind
 
 _AS_ONE = 0.95  # of the pieces of a group that fails
-_FAILS = 0.02  # probability per piece
 _RECOVERS = 0.1  # probability per piece
 _KINDS: tuple[LineKind, ...] = ("converter", "bus", "group")
 
@@ -52,9 +51,8 @@ def log_of(groups: GroupModel, log: LifeLog, eligible: Mask) -> tuple[LevelLog, 
     state = groups.states(log.loads, log.readings, log.constant, eligible)
     on = groups.on.T.astype(np.float64)
     readings = np.where(np.isnan(log.readings), 0.0, log.readings) @ on / on.sum(axis=0)
-    # The chain knows that successive pieces are alike: each is a unit.
-    pieces = np.diff(np.append(log.unit_begins, len(state)))
-    weight = np.repeat(log.weight, pieces)
+    # The chain knows that successive pieces are alike: each is a unit, independent of the others.
+    weight = np.ones(len(state))
     own = LevelLog(state.astype(np.float64), readings, log.piece, groups, weight, state, unit=1)
     group = np.arange(state.shape[1])
     healthy = groups.table[groups.of_cell(group), before(state, log.piece), state]
@@ -74,11 +72,14 @@ class GroupTest:
 
     Attributes:
         evidence: float ``[G]``, log ratio fails as a whole : healthy, before the factors.
+        holds: bool ``[G]``, groups that seem to have broken once and for all, and hold a value
+            since: their cells tell which.
         dead: float ``[units, G]``, the same of the worst piece of each unit.
         since: int ``[G]``, number of the first frame in which it failed.
     """
 
     evidence: Floats
+    holds: Mask
     dead: Floats
     since: NDArray[np.intp]
 
@@ -87,15 +88,16 @@ def tested_groups(log: LifeLog, groups: GroupModel, eligible: Mask) -> GroupTest
     """Return the evidence of each group; ``eligible``: bool ``[D]``, cells that tell of theirs."""
     own, healthy = log_of(groups, log, eligible)
     dead = own.counted(_failing(own.level) - healthy)
-    evidence, _ = dies_and_recovers(dead, _FAILS, _RECOVERS)
+    # How often a group fails is not known: at least once.
+    recovers, _ = dies_and_recovers(dead, 1 / len(dead), _RECOVERS)
     lasting = from_some_unit(dead)
-    # Its cells tell more of a group that broke once and for all, and holds a value since.
     begins = own.unit_begins[np.flip(dead, axis=0).cumsum(axis=0)[::-1].argmax(axis=0)]
     since = [own.readings[begin:, g] for g, begin in enumerate(begins.tolist())]
     holds = np.array([np.ptp(readings) <= 2 * groups.tolerance for readings in since])
-    evidence = np.where(holds & (lasting >= evidence), 0.0, np.maximum(evidence, lasting))
+    holds &= lasting >= recovers
+    evidence = np.maximum(recovers, lasting)
     of_unit = np.maximum.reduceat(dead, log.unit_begins, axis=0)
-    return GroupTest(evidence, of_unit, _first_frames(own, dead, log.ends_as_one))
+    return GroupTest(evidence, holds, of_unit, _first_frames(own, dead, log.ends_as_one))
 
 
 def _first_frames(
@@ -149,7 +151,7 @@ def fit_groups(
         levels=np.zeros(0),
         predicted=np.zeros(0),
         table=np.zeros((0, 0, 0), np.float32),
-        independent=held_out[0].independent,
+        independent=1.0,
         errs=np.zeros(0),
         reached=np.zeros((1, len(on))),
         units=1,
@@ -178,7 +180,7 @@ def fit_groups(
         # Groups are alike: what was never seen of any of them is rare in each.
         ratios.append(own.by_unit(_failing(own.level) - healthy).reshape(-1, 1))
     one = np.ones(1, bool)
-    errs, without = shares_of_errors(ratios, blank.independent, one, one)
+    errs, without = shares_of_errors(ratios, blank.independent, one, one, least=0.0)
     return replace(fitted, errs=np.repeat(errs, len(on))), [
         replace(model, errs=np.repeat(of, len(on)))
         for model, of in zip(models, without, strict=True)

@@ -87,7 +87,11 @@ def shrinkage_of(counts: Floats, total: Floats) -> Floats:
 
 
 def shares_of_errors(
-    ratios: Sequence[Floats], independent: float, present: Mask, used: Mask
+    ratios: Sequence[Floats],
+    independent: float,
+    present: Mask,
+    used: Mask,
+    least: float = MAJORITY,
 ) -> tuple[Floats, list[Floats]]:
     """Return the share of units in which each healthy cell contradicts, ``[D]``, and the same
     without each fold.
@@ -99,6 +103,7 @@ def shares_of_errors(
         independent: share of the units that count as independent of each other.
         present: bool ``[D]``, cells that count.
         used: bool ``[D]``, those that the reference loaded.
+        least: share of a cell at least, of that of all.
     """
     every = np.concatenate(ratios)[:, present].ravel()
     usual = max(
@@ -113,7 +118,7 @@ def shares_of_errors(
     def share(erred: Floats, units: Floats) -> Floats:
         found: Floats = (erred.sum(axis=0) + usual * OWN_ERRS) / (units.sum() + OWN_ERRS)
         # The rule of three: what was never seen in n units.
-        found = np.clip(found, max(usual / 2, 3 / units.sum()), MAJORITY / 2)
+        found = np.clip(found, max(least * usual, 3 / units.sum()), MAJORITY / 2)
         # what the reference hardly loaded is hardly known
         return np.where(used, found, MAJORITY / 2)
 

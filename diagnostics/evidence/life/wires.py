@@ -188,7 +188,7 @@ def _failing_groups(log: LifeLog, eligible: Mask) -> FailingWires:
     test = tested_groups(log, groups, eligible)
     scaled = test.evidence * groups.factors(log.units)[0]
     of_cell = np.where(groups.on & eligible, scaled[:, None], 0.0).max(axis=0)
-    proven = scaled > _PROVEN
+    proven = (scaled > _PROVEN) & ~test.holds
     # What most of them do is the array's, or that of the recordings.
     if proven.sum() > MAJORITY * len(proven):
         return failing

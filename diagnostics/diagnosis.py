@@ -66,7 +66,15 @@ from diagnostics.sensor.rewiring import Rewiring, find_rewiring
 from diagnostics.sensor.shared import Shared, measured
 from diagnostics.sensor.swapped_in_part import SwappedInPart, find_swapped_in_part
 from diagnostics.threads import one_thread
-from diagnostics.when import OWN_REFERENCE, Held, Spans, filled, find_held, own_reference
+from diagnostics.when import (
+    OWN_REFERENCE,
+    Held,
+    Spans,
+    filled,
+    find_held,
+    own_reference,
+    reads_enough,
+)
 from diagnostics.when.reference_findings import (
     ReferenceFinding,
     ReferenceWarning,
@@ -130,6 +138,7 @@ class SelfDiagnosis:
     _model: Model | None = None
     _held_out: tuple[Sequence[NDArray[Any]], NDArray[np.float64]] | None = None
     reference_findings_: tuple[ReferenceFinding, ...] = ()
+    _of_log = False  # the reference is a part of the log, which nobody stated to be healthy
 
     def __init__(
         self,
@@ -407,6 +416,7 @@ class SelfDiagnosis:
         if not _shows_contacts(first, log, self.layout):
             return self
         own = SelfDiagnosis(**self.get_params())
+        own._of_log = True
         with one_thread():
             cold = self._diagnosed(log)
             return own._fit(first, progress, np.where(cold.fault_set.mask, cold.probability, 0.0))
@@ -825,6 +835,10 @@ class SelfDiagnosis:
     ) -> Diagnosis:
         """Return the diagnosis of a log with the recordings in which faults show."""
         whole = self._judged(log, crosstalk)
+        if self._of_log or self.reference_ is None:
+            spans = Spans.of(RecordingBlocks(self._in_planes(log)))
+            enough = reads_enough(spans, self._planes)[self._place]
+            whole = replace(whole, tested=whole.tested & (enough | whole.fault_set.mask))
         if self.reference_ is None or len(log) < 2:
             return whole
         held = self._held(log, self.reference_.tolerance, classes)

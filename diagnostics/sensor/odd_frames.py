@@ -272,6 +272,7 @@ class _Test:
         self._present = layout.present.ravel()
         self._sample = sample
         self._highest = float(np.nanmax(sample[:, self._present]))
+        self._least_of: dict[bytes, float] = {}
 
     def odd(self, recording: int, frames: NDArray[Any]) -> list[OddFrame]:
         """Return the odd frames among those of a recording ``[T, D]`` with this number."""
@@ -360,7 +361,7 @@ class _Test:
 
     def _disagrees(self, frame: Floats, jumped: Mask, on: Mask) -> bool:
         """Return whether the loads of a frame ``[D]`` agree with those of their neighbours less
-        than usual loads do, and not more than by chance.
+        than usual loads of the same cells do, and not more than by chance.
 
         Args:
             frame: ``[D]``.
@@ -369,34 +370,38 @@ class _Test:
         """
         if jumped.sum() < _ENOUGH:
             return False
-        beside, least = self._neighbours
         loads = np.nan_to_num(frame - self._rest)
         loaded = np.abs(loads) > self._usual.least
         if loaded[jumped].mean() < MAJORITY:  # they fell to their rest
             return False
-        agreement, chance = _agreement(loads, on & (jumped | loaded), beside)
-        return bool(agreement < least and chance > P_MIN)
+        agreement, chance = _agreement(loads, on & (jumped | loaded), self._beside)
+        return bool(agreement < self._least(on) and chance > P_MIN)
 
     @cached_property
-    def _neighbours(self) -> tuple[NDArray[np.intp], float]:
-        """The neighbours of each cell, ``[D, k]`` with -1 for none, and the agreement with them
-        that a twentieth of the usual loads does not reach, at most half of the usual one; 0 where
+    def _beside(self) -> NDArray[np.intp]:
+        """The neighbours of each cell, ``[D, k]``; -1: none."""
+        ways = [self._layout.beside, _followers(self._sample)[:, None]]
+        usual = [np.median(self._agreements(beside, self._present)) for beside in ways]
+        return ways[int(np.argmax(usual))]
+
+    def _least(self, on: Mask) -> float:
+        """Return the least agreement of usual loads on some cells (bool ``[D]``) with their
+        neighbours, at most half of the usual one."""
+        key = on.tobytes()
+        if key not in self._least_of:
+            usual = self._agreements(self._beside, on)
+            self._least_of[key] = min(*usual, MAJORITY * float(np.median(usual)))
+        return self._least_of[key]
+
+    def _agreements(self, beside: NDArray[np.intp], on: Mask) -> list[float]:
+        """Return how usual loads of some cells (bool ``[D]``) agree with those ``beside``; 0 where
         it is unknown."""
         loads = np.nan_to_num(self._sample - self._rest)
-        loaded = np.abs(loads) > self._usual.least
-        by_load = np.argsort(-loaded.sum(axis=1), kind="stable")
-        some = by_load[: max(1, len(by_load) // 4)]
-        some = some[:: max(1, len(some) // _SAMPLE)]
-        best = self._layout.beside, 0.0, 0.0
-        ways = [self._layout.beside, _followers(self._sample)[:, None]]
-        for beside in ways:
-            of_frames = [_agreement(loads[t], loaded[t], beside) for t in some]
-            known = [agreement for agreement, chance in of_frames if chance < 1]
-            usual = float(np.median(known)) if known else 0.0
-            if usual > best[1]:
-                least = min(float(np.quantile(known, LOW)), MAJORITY * usual)
-                best = beside, usual, least
-        return best[0], best[2]
+        loaded = (np.abs(loads) > self._usual.least) & on
+        some = np.flatnonzero(loaded.sum(axis=1) >= _ENOUGH)
+        some = some[:: max(1, len(some) // _SAMPLE)].tolist()
+        of_frames = [_agreement(loads[t], loaded[t], beside) for t in some]
+        return [agreement for agreement, chance in of_frames if chance < 1] or [0.0]
 
 
 def evenly(

@@ -20,7 +20,15 @@ faults within a recording.
 
 from diagnostics.when.filling import filled
 from diagnostics.when.held import Held, find_held
-from diagnostics.when.own_reference import OWN_REFERENCE, own_reference
+from diagnostics.when.own_reference import OWN_REFERENCE, own_reference, reads_enough
 from diagnostics.when.spans import Spans
 
-__all__ = ["OWN_REFERENCE", "Held", "Spans", "filled", "find_held", "own_reference"]
+__all__ = [
+    "OWN_REFERENCE",
+    "Held",
+    "Spans",
+    "filled",
+    "find_held",
+    "own_reference",
+    "reads_enough",
+]

@@ -3,15 +3,28 @@
 Of each class the first half is taken: a cell that fails later is compared with how it worked
 before, and recordings that lie class by class say nothing of other classes. Recordings with suspect
 cells take part, with these readings filled, only where the others are too few.
+
+Such a reference does not tell how much a cell should read. The cells beside it do: one that never
+moves half as far as they do may be worn, or hardly touched.
+
+Not detected: worn cells beside worn ones, and a contact of their own.
 """
 
 from __future__ import annotations
 
-import numpy as np
-from numpy.typing import ArrayLike
+from typing import TYPE_CHECKING
 
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from diagnostics.preprocessing.levels import MAJORITY
+from diagnostics.preprocessing.quantiles import known_quantile
 from diagnostics.preprocessing.readings import RecordingBlocks
 from diagnostics.when.held import Held
+from diagnostics.when.spans import Spans
+
+if TYPE_CHECKING:
+    from diagnostics.layout import SensorLayout
 
 # recordings from which on a log is its own reference: with a model of ten, healthy cells are blamed
 OWN_REFERENCE = 32
@@ -36,3 +49,23 @@ def own_reference(log: RecordingBlocks, held: Held, classes: ArrayLike | None) -
     others = [i for i in np.flatnonzero(clean).tolist() if i not in chosen]
     chosen += others[: max(0, n // 2 - len(chosen))]
     return sorted(chosen)
+
+
+def reads_enough(spans: Spans, layout: SensorLayout) -> NDArray[np.bool_]:
+    """Return the cells that move at least half as far as those beside them in some recording in
+    which these move at least half as far as they ever do, bool ``[D]``.
+
+    Args:
+        spans: of the recordings.
+        layout: the array.
+    """
+    present = layout.present.ravel()
+    on = (layout.beside >= 0) & present[layout.beside]
+    moves = np.where(spans.known & present, spans.ranges, np.nan)
+    beside = np.stack(
+        [known_quantile(np.where(on, one[layout.beside], np.nan), 0.5, axis=1) for one in moves]
+    )
+    beside = np.nan_to_num(beside)  # where there are none, nothing contradicts
+    far = beside >= MAJORITY * beside.max(axis=0)
+    found: NDArray[np.bool_] = (far & (spans.ranges >= MAJORITY * beside)).any(axis=0)
+    return found

@@ -2,6 +2,8 @@
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 import adaptfault as af
 from diagnostics import SelfDiagnosis, SensorLayout
@@ -76,6 +78,18 @@ def test_healthy_logs_and_a_contact_of_one_frame_have_no_odd_frame(log):
         tapped[recording][frame] = loaded[loaded.sum(axis=1).argmax()]
     assert find_odd_frames(log, LAYOUT) == ()
     assert find_odd_frames(tapped, LAYOUT) == ()
+
+
+@settings(max_examples=20, deadline=None)
+@given(
+    rows=st.lists(st.integers(0, 6), min_size=2, max_size=2, unique=True),
+    where=st.sets(st.integers(0, 11)),
+)
+def test_rows_that_are_exchanged_in_some_recordings_make_no_frame_odd(log, rows, where):
+    swapped = [frames.reshape(-1, *LAYOUT.shape).copy() for frames in log]
+    for recording in where:
+        swapped[recording][:, 0, rows] = swapped[recording][:, 0, rows[::-1]]
+    assert not find_odd_frames([frames.reshape(-1, D) for frames in swapped], LAYOUT)
 
 
 def test_lost_frames_and_missing_readings_are_no_odd_frames(log):

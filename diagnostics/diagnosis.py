@@ -789,8 +789,10 @@ class SelfDiagnosis:
     ) -> Diagnosis:
         stream = self.stream(needed)
         stream.crosstalk = crosstalk
-        for frames in log.blocks():
-            stream.extend(frames)
+        for i in range(len(log)):
+            stream.begin_recording()
+            for frames in log[i : i + 1].blocks():
+                stream.extend(frames)
         if self._model is not None:
             return self._diagnosed_by_model(self._model, log, stream.complete())
         return self.evaluate(stream, n_recordings=len(log))

@@ -59,6 +59,7 @@ def inspect_parts(
             stream.crosstalk = crosstalk.joined(stream.crosstalk)
         with one_thread():
             for frames in one.readings.frames:
+                stream.begin_recording()
                 stream.extend(frames)
         inspected.append(_without_frames(one))
     if not stream.received.any():  # all cells show one signal, or none has a reading

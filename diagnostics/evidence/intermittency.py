@@ -17,7 +17,8 @@ Jeffreys' prior of a Poisson rate (1946). Noise is the median absolute second di
 c <= 1 keeps all but 1 % of healthy cells below 14 / 1.5, at the rates of other recordings
 (overdispersion, as in a quasi-likelihood: McCullagh and Nelder 1989). Segments in which many cells
 blink or are noisy together do not count: the contact moves. Blinks without load, and noise of
-constant cells, are not detected.
+constant cells, are not detected; nor is either in recordings of fewer than five frames: there is
+no time between the frames of two recordings.
 """
 
 from __future__ import annotations
@@ -222,6 +223,7 @@ class Intermittency:
         usual: HealthyRates,
         constant: NDArray[np.bool_],
         full: float = _MAX,
+        begins: NDArray[np.bool_] | None = None,
     ) -> Intermittency:
         """Return the sums after one more segment.
 
@@ -233,7 +235,11 @@ class Intermittency:
             usual: rates of healthy cells.
             constant: bool ``[D]``, cells that do not move in these frames, and do not count.
             full: upper limit of the sums.
+            begins: bool ``[t]``, frames that begin a recording; None: all follow each other.
         """
+        recording = None
+        if begins is not None and begins.any():
+            frames, root, recording = _of_some_length(frames, root, np.cumsum(begins))
         if len(frames) < SHORTEST_RUN or constant.all():
             return self
         moving = np.flatnonzero(~constant)
@@ -246,7 +252,7 @@ class Intermittency:
             ),
         )
         low, high, loaded, noise_level, level = _measure(
-            frames, root, scale, moving, self.layout, usual.alone, lowest
+            frames, root, scale, moving, self.layout, usual.alone, lowest, recording
         )
         events = low + high
         crowd = max(1.0, _CROWD * float((loaded > 0).sum()))
@@ -307,6 +313,15 @@ class Intermittency:
         return found
 
 
+def _of_some_length(
+    frames: Floats, root: Array, recording: NDArray[np.intp]
+) -> tuple[Floats, Array, NDArray[np.intp]]:
+    """Return the frames, root loads and numbers ``[t]`` of the recordings without those of which
+    there are too few frames here to tell of time."""
+    enough = np.bincount(recording)[recording] >= SHORTEST_RUN
+    return frames[enough], root[enough], recording[enough]
+
+
 def _measure(
     frames: Floats,
     root: Array,
@@ -315,11 +330,13 @@ def _measure(
     layout: SensorLayout,
     alone: bool,
     lowest: float,
+    recording: NDArray[np.intp] | None = None,
 ) -> tuple[NDArray[np.intp], NDArray[np.intp], Floats, Floats, NDArray[np.intp]]:
     """Return for each of the ``cells``: blinks to the baseline, blinks to full scale, loaded
     frames, noise, load level.
 
-    With ``alone``, blinks that a neighbour shares do not count.
+    With ``alone``, blinks that a neighbour shares do not count. Only frames of one ``recording``
+    (int ``[t]``, its number; None: all are of one) are compared.
     """
     every = frames
     frames = frames.take(cells, axis=1)
@@ -352,6 +369,8 @@ def _measure(
             before = of[: -gap - 1]
             after = of[gap + 1 :]
             same_load = np.abs(after - before) <= ALIKE * before
+            if recording is not None:
+                same_load &= (recording[gap + 1 :] == recording[: -gap - 1])[:, None]
             when, which = np.nonzero(
                 loaded_before[: -gap - 1] & missing[1:-1] & loaded_before[gap + 1 :] & same_load
             )
@@ -370,6 +389,8 @@ def _measure(
     curvature = (
         np.abs(step[1:] - step[:-1]) if len(x) > 2 else np.zeros((1, x.shape[1]), np.float32)
     )
+    if recording is not None:
+        curvature = curvature[recording[2:] == recording[:-2]]
     noise_level = _median(curvature) / scale.full_scale
     level = np.searchsorted(_LEVELS, root.sum(axis=0) / np.float32(len(root)), side="right") - 1
     # A load near full scale may reach it without a fault.

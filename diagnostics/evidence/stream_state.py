@@ -146,6 +146,8 @@ class StreamState:
         self._absent = not self.present.all()  # whether some position has no cell
         self._buffer = np.empty((SEGMENT, layout.n_cells))
         self._numbers = np.empty(SEGMENT, np.intp)
+        self._begins = np.zeros(SEGMENT, bool)  # frames that begin a recording
+        self._begins_next = False
         self._filled = 0
         self._models: dict[int, Model] = {}
 
@@ -153,6 +155,10 @@ class StreamState:
     def begun(self) -> list[int]:
         """First frames of the last contact events of the skin as a whole."""
         return self._begun if self.tiled else [event.first for event in self.local.of[0].kept]
+
+    def begin_recording(self) -> None:
+        """Take the next frame as the first one of a recording: it does not follow the last one."""
+        self._begins_next = True
 
     def extend(self, frames: NDArray[np.float64]) -> bool:
         """Take in frames ``[t, D]`` of readings; return whether a segment was completed."""
@@ -177,6 +183,9 @@ class StreamState:
             chosen = new[taken : taken + n]
             self._buffer[self._filled : self._filled + n] = frames[chosen]
             self._numbers[self._filled : self._filled + n] = chosen + before
+            self._begins[self._filled : self._filled + n] = False
+            self._begins[self._filled] = self._begins_next
+            self._begins_next = False
             self._filled += n
             taken += n
             if self._filled == SEGMENT:
@@ -204,6 +213,7 @@ class StreamState:
         vars(other).update(vars(self))
         other._buffer = self._buffer.copy()
         other._numbers = self._numbers.copy()
+        other._begins = self._begins.copy()
         return other
 
     def reading(self, load: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -542,6 +552,7 @@ class StreamState:
             self._drop()
         frames = self._buffer[: self._filled]
         numbers = self._numbers[: self._filled]
+        begins = self._begins[: self._filled]
         self._filled = 0
         self._offsets = self._offsets.extend(
             frames, self.reference.scale, self.present, self.reference.offset
@@ -599,7 +610,9 @@ class StreamState:
             # between two lines.
             frames = np.where(runs.moved, frames, np.nan)
         usual = self.reference.usual.with_noise(noise / plain.full_scale)
-        self.intermittency = self.intermittency.extend(known, root, numbers, noisy, usual, still)
+        self.intermittency = self.intermittency.extend(
+            known, root, numbers, noisy, usual, still, begins=begins
+        )
         # Lines that only have noise where they rest agree by chance.
         telling = informative(frames, still, clear) & self.touched
         self.duplicates = self.duplicates.extend(frames, numbers, telling, plain.near)

@@ -34,6 +34,7 @@ from diagnostics.preprocessing.levels import LIGHT, LOW, P_MIN
 from diagnostics.preprocessing.quantiles import known_quantile
 
 _LEAST = 5  # recordings, new and reference
+_FEW_PAIRS = 10_000  # of a new and a reference recording: a size
 _HIGH = 0.99  # quantile of the readings of a recording: its load
 
 
@@ -191,7 +192,12 @@ def differ(new: NDArray[np.float64], old: NDArray[np.float64]) -> bool:
     chance."""
     from scipy.stats import ks_2samp  # slow to import, and rarely needed
 
-    return min(len(new), len(old)) >= _LEAST and bool(ks_2samp(new, old).pvalue < P_MIN)
+    if min(len(new), len(old)) < _LEAST:
+        return False
+    # the exact distribution of many overflows, with a warning
+    few = len(new) * len(old) <= _FEW_PAIRS
+    p = ks_2samp(new, old, method="exact" if few else "asymp").pvalue
+    return bool(p < P_MIN)
 
 
 def _statistics(

@@ -25,14 +25,29 @@ def usual() -> HealthyRates:
 
 
 def evidence_of(
-    log: np.ndarray, usual: HealthyRates, still: np.ndarray = CONSTANT, scale: Scale = SCALE
+    log: np.ndarray,
+    usual: HealthyRates,
+    still: np.ndarray = CONSTANT,
+    scale: Scale = SCALE,
+    length: int | None = None,
 ) -> Intermittency:
+    """Return the sums after a log, which consists of recordings of some ``length``; None: of
+    one."""
+    begins = np.zeros(len(log), bool)
+    if length is not None:
+        begins[::length] = True
     intermittency = Intermittency.begin(LAYOUT)
     for first in range(0, len(log), 32):
         frames = log[first : first + 32]
         numbers = np.arange(first, first + len(frames))
         intermittency = intermittency.extend(
-            frames, scale.root_load(frames), numbers, scale, usual, still
+            frames,
+            scale.root_load(frames),
+            numbers,
+            scale,
+            usual,
+            still,
+            begins=begins[numbers],
         )
     return intermittency
 
@@ -268,3 +283,23 @@ def test_weak_loads_that_a_threshold_hides_do_not_blink(fitted: bool):
     assert cells(evidence_of(thresholded(9), reference).intermittent) == []
     broken = inject(thresholded(9), [Fault("intermittent", (7,), value=0.0)], LAYOUT, seed=0)
     assert 7 in cells(evidence_of(broken, reference).intermittent)
+
+
+@pytest.mark.parametrize("length", [1, 2, 3, 5, 12, 50])
+def test_recordings_that_differ_from_each_other_neither_blink_nor_are_noisy(length: int):
+    def recordings(seed: int) -> list[np.ndarray]:
+        rng = np.random.default_rng(seed)
+        steady = rng.choice([0.0, 1.0, 3.0, 5.0], (600 // length, 1, CELLS))
+        shape = (len(steady), length, CELLS)
+        return list(np.clip(steady + rng.normal(0, 0.01, shape), 0, 5))
+
+    reference = HealthyRates.fit(recordings(1), SCALE, LAYOUT)
+    log = np.concatenate(recordings(2))
+    for usual in (reference, HealthyRates.unknown()):
+        found = evidence_of(log, usual, length=length)
+        assert cells(found.intermittent | found.excess) == []
+
+
+def test_a_cell_that_blinks_in_short_recordings_is_intermittent(usual):
+    log = inject(healthy(30), [Fault("intermittent", (7,), value=0.0)], LAYOUT, seed=0)
+    assert cells(evidence_of(log, usual, length=20).intermittent) == [7]

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from diagnostics import SensorLayout
-from diagnostics.sensor.sensor_change import pad_change, sensor_change
+from diagnostics.sensor.sensor_change import differ, pad_change, sensor_change
 
 LAYOUT = SensorLayout(1, 6, 6)
 CELLS = np.arange(36)
@@ -123,3 +123,10 @@ def test_an_offset_of_a_pad_is_told_and_measured():
 def test_one_pad_alone_and_recordings_without_readings_tell_of_no_pad():
     assert pad_change(grasps(12, 1), grasps(60, 99), LAYOUT, CELLS) is None
     assert pad_change([np.full((3, 72), np.nan)] * 9, on_pads(60, 99), PADS, np.arange(72)) is None
+
+
+@pytest.mark.parametrize("others", [1, 5, 200])
+def test_hundreds_of_recordings_are_compared_without_a_warning(others: int):
+    new = np.ones(400)
+    new[:others] = 0.0
+    assert differ(new, np.ones(400)) == (others == 200)

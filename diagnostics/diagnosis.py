@@ -670,14 +670,14 @@ class SelfDiagnosis:
         if stream.reference.life is None or stream.noisier:
             return Life.assumed(stream.layout.n_cells)
         evidence = stream.evidence_of_life()
-        # Cells that move by themselves mislead the spatial test; those that never moved say nothing
-        # yet.
-        first = stream.proof_of_life(evidence, explained, ~stream.runs.moved)
+        # Cells that move by themselves mislead the spatial test; those that never moved, or hold a
+        # value in some recordings, say nothing yet.
+        first = stream.proof_of_life(evidence, explained, ~stream.runs.moved | stream.held)
         life = first.finish()
         log_ratio = self._log_ratio(stream, life)
         spatial, found = self._tested(stream, explained, log_ratio, life)
         # Cells that the spatial test suspects predict no others.
-        suspected = spatial.scored & (found.faulty | stream.suspected(spatial))
+        suspected = spatial.scored & (found.faulty | stream.suspected(spatial)) | stream.held
         life = stream.proof_of_life(evidence, explained, suspected, first).finish()
         return life if stream.crosstalk is None else life.undecided()
 
@@ -743,16 +743,18 @@ class SelfDiagnosis:
         is_known = stream.load is not None or self.reference_ is not None
         return False if is_known or self.layout.rest != "learn" else None
 
-    def _judged(self, log: RecordingBlocks, crosstalk: Crosstalk | None) -> Diagnosis:
+    def _judged(
+        self, log: RecordingBlocks, crosstalk: Crosstalk | None, held: NDArray[np.bool_]
+    ) -> Diagnosis:
         """Return the diagnosis of a log, without a gain of the whole array where that explains
-        faults."""
-        found = self._diagnosed(log, crosstalk=crosstalk)
+        faults; ``held`` cells (bool ``[D]``) predict no others."""
+        found = self._diagnosed(log, crosstalk=crosstalk, held=held)
         usual = None
         if found.faults and crosstalk is None:
             usual = self.without_gain(log.given)
         if usual is None:
             return found
-        without = self._diagnosed(usual)
+        without = self._diagnosed(usual, held=held)
         return without if without.n_lost < found.n_lost else found
 
     def without_gain(self, recordings: ArrayLike | Sequence[ArrayLike]) -> RecordingBlocks | None:
@@ -786,9 +788,12 @@ class SelfDiagnosis:
         log: RecordingBlocks,
         needed: NDArray[np.bool_] | None = None,
         crosstalk: Crosstalk | None = None,
+        held: NDArray[np.bool_] | None = None,
     ) -> Diagnosis:
         stream = self.stream(needed)
         stream.crosstalk = crosstalk
+        if held is not None:
+            stream.held = held[self._order]
         for i in range(len(log)):
             stream.begin_recording()
             for frames in log[i : i + 1].blocks():
@@ -836,20 +841,27 @@ class SelfDiagnosis:
         self, log: RecordingBlocks, classes: ArrayLike | None, crosstalk: Crosstalk | None
     ) -> Diagnosis:
         """Return the diagnosis of a log with the recordings in which faults show."""
-        whole = self._judged(log, crosstalk)
+        tolerance = tolerance_of(log, self.layout)
+        if self.reference_ is not None:
+            tolerance = self.reference_.tolerance
+        held = self._held(log, tolerance, classes)
+
+        def judged(some: RecordingBlocks) -> Diagnosis:
+            return self._judged(some, crosstalk, held.suspect.any(axis=0))
+
+        whole = judged(log)
         if self._of_log or self.reference_ is None:
             spans = Spans.of(RecordingBlocks(self._in_planes(log)))
             enough = reads_enough(spans, self._planes)[self._place]
             whole = replace(whole, tested=whole.tested & (enough | whole.fault_set.mask))
         if self.reference_ is None or len(log) < 2:
             return whole
-        held = self._held(log, self.reference_.tolerance, classes)
         return with_recordings(
             whole,
             held,
             [len(given) for given in log.given],
-            self.reference_.tolerance,
-            lambda some: self._judged(RecordingBlocks([log.given[i] for i in some]), crosstalk),
+            tolerance,
+            lambda some: judged(RecordingBlocks([log.given[i] for i in some])),
         )
 
     def _held(self, log: RecordingBlocks, tolerance: float, classes: ArrayLike | None) -> Held:

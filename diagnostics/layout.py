@@ -53,6 +53,8 @@ class SensorLayout:
             any.
         names: what the recordings call each cell, ``[D]``, as "L_ch10"; None: they do not. Layouts
             with other names are equal.
+        device: which specimen it is, as a serial number or the name of the robot; None: unknown, or
+            several. Layouts of other devices are equal.
 
     Raises:
         ValueError: a size below 1, a full scale or rate that is not positive, ``present`` of
@@ -72,6 +74,7 @@ class SensorLayout:
     axes: int = field(default=1, kw_only=True)
     rest: Rest = field(default="learn", kw_only=True)
     names: Sequence[str] | None = field(default=None, kw_only=True, repr=False)
+    device: str | None = field(default=None, kw_only=True, repr=False)
 
     def __post_init__(self) -> None:
         for name in ("pads", "rows", "cols", "axes"):
@@ -113,6 +116,8 @@ class SensorLayout:
                 raise ValueError(
                     f"{name} is one of {', '.join(choices)}; got {getattr(self, name)!r}{also}"
                 )
+        if self.device is not None and not (_is_name(self.device) and self.device):
+            raise ValueError(f"device: expected a printable name; got {self.device!r}")
         if self.names is not None:
             names = tuple(self.names)
             if len(names) != self.n_cells or not all(map(_is_name, names)):
@@ -432,6 +437,8 @@ class SensorLayout:
             d["groups"] = {name: list(of) for name, of in self.groups.items()}
         if self.names is not None:
             d["names"] = list(self.names)
+        if self.device is not None:
+            d["device"] = self.device
         # What differs from the default.
         return d | {
             name: getattr(self, name)
@@ -463,6 +470,7 @@ class SensorLayout:
             "present",
             "groups",
             "names",
+            "device",
             *_DEFAULTS,
         )
         if unknown := set(d) - set(known) - {"schema"}:

@@ -146,9 +146,9 @@ def of_change(before: float, after: float) -> int:
 
 
 def untested(diagnosis: Diagnosis) -> str | None:
-    """Return that a log tests too few of the cells, or no cell of a pad, in one sentence; None
+    """Return that a log tests too few of the cells, or what may be faulty, in one sentence; None
     where it tests enough."""
     share = diagnosis.coverage.test_coverage
     if share < UNTESTED:
         return f"only {share:.0%} of the cells were tested, so faults may be hidden"
-    return "; ".join(wire.reason for wire in diagnosis.unused) or None
+    return "; ".join(fault.reason for fault in diagnosis.possible) or None

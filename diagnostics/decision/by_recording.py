@@ -2,7 +2,8 @@
 
 The whole log tells what is faulty at its end. Recordings in which cells hold a value although those
 beside them move (:mod:`diagnostics.when`) are diagnosed as a log of their own; what that finds
-besides shows in these recordings. Cells whose held values are certain are faulty in any case.
+besides shows in these recordings. Cells whose held values are certain are faulty in any case; what
+is suspect and not proven is possible.
 """
 
 from __future__ import annotations
@@ -87,10 +88,23 @@ def with_recordings(
     for fault in _held_faults(certain, held, whole.layout, tolerance):
         assert fault.recordings is not None
         faults.append(_told(replace(fault, onset=first[fault.recordings[0]]), last))
+        found |= set(fault.cells)
         cells = list(fault.cells)
         probability[cells] = np.maximum(probability[cells], fault.probability or 0.0)
+    unproven = np.asarray(held.suspect.any(axis=0))
+    unproven[list(found)] = False
+    possible = [
+        _told(replace(fault, reason=f"perhaps {fault.reason}: press on it to tell"), last)
+        for fault in _held_faults(unproven, held, whole.layout, tolerance)
+    ]
     tested[[cell for fault in faults for cell in fault.cells]] = True
-    result = replace(whole, faults=tuple(faults), probability=probability, tested=tested)
+    result = replace(
+        whole,
+        faults=tuple(faults),
+        probability=probability,
+        tested=tested,
+        possible=(*whole.possible, *possible),
+    )
     return replace(result, states=_verdicts(result, held, first))
 
 

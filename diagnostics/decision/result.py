@@ -88,8 +88,8 @@ class Diagnosis:
         tested: bool ``[D]``, the log tested whether the cell works.
         n_frames: number of frames in the log.
         n_recordings: number of recordings in the log.
-        possible: wires that are more likely broken than not, but not proven. Their cells are in F
-            only as faults of their own.
+        possible: wires and cells that are more likely faulty than not, but not proven. Their cells
+            are in F only as faults of their own.
         static_loads: objects that lie still on the array. Their cells are UNTESTED.
         transport: lost frames, frozen streams and invalid readings: faults of the link, not of
             cells.
@@ -169,21 +169,6 @@ class Diagnosis:
     def n_lost(self) -> int:
         """The number of cells that are faulty, or disturbed by a static load."""
         return len(self.fault_set | self.disturbed)
-
-    @property
-    def unused(self) -> tuple[Fault, ...]:
-        """The possible wires of whole pads: nothing touched these, or they are cut off."""
-        layout = self.layout
-        pads = [
-            np.flatnonzero((layout.pad_of == pad) & layout.present.ravel())
-            for pad in range(layout.pads)
-        ]
-        return tuple(
-            wire
-            for wire in self.possible
-            if wire.line is not None
-            and any(np.isin(pad, layout.cells_on(wire.line)).all() for pad in pads)
-        )
 
     def suspects(self, probability: float = 0.02) -> FaultSet:
         """Return F and every tested cell with at least this P(faulty): the cells that a classifier

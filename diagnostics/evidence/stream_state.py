@@ -98,6 +98,7 @@ class StreamState:
         below: bool ``[D]``, cells that last read less than at rest.
         life: the record for the proof of life; empty without a model of it.
         crosstalk: of lines, that the reference does not have; None: not known.
+        held: bool ``[D]``, cells that hold a value in some recordings while those beside move.
     """
 
     def __init__(
@@ -142,6 +143,7 @@ class StreamState:
         self._level = RestLevel.begin(layout.n_cells)
         self.life = LifeRecord()
         self.crosstalk: Crosstalk | None = None
+        self.held = np.zeros(layout.n_cells, bool)
         self._of_pad = PadLevel.begin(layout.n_cells)
         self._absent = not self.present.all()  # whether some position has no cell
         self._buffer = np.empty((SEGMENT, layout.n_cells))

@@ -6,10 +6,15 @@ import json
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from adaptfault.data.recordings.valid import valid_masks
 from adaptfault.data.simulated_grasps import simulate
+from adaptfault.inspection.severity import untested
 from diagnostics import Diagnosis, Fault, FaultKind, SelfDiagnosis, SensorLayout, Verdict
+from diagnostics.decision.by_recording import with_recordings
+from diagnostics.when import Held
 from diagnostics.when.reference_findings import ReferenceWarning
 
 LAYOUT = SensorLayout(1, 8, 8)
@@ -50,6 +55,25 @@ def test_what_is_dead_for_some_recordings_and_works_again_is_found_with_them(dia
     assert diagnosis.exit_code == 2
     assert {fault.recordings for fault in diagnosis.faults} == {MIDDLE}
     assert all("in recordings 14 to 27; it works again" in f.reason for f in diagnosis.faults)
+
+
+@given(
+    cells=st.sampled_from([ROW, [STUCK], DEAD]),
+    where=st.sets(st.integers(0, 19), min_size=1, max_size=19),
+    evidence=st.floats(3, 20),
+)
+def test_whatever_is_suspect_is_faulty_or_told_as_possible_and_untested(cells, where, evidence):
+    suspect = np.zeros((20, 64), bool)
+    suspect[np.ix_(sorted(where), cells)] = True
+    of_cells = np.where(suspect.any(axis=0), evidence, -np.inf)
+    held = Held(of_cells, suspect, ~suspect, np.where(suspect.any(axis=0), 0.0, np.nan))
+    whole = Diagnosis(LAYOUT, (), np.zeros(64), np.ones(64, bool), 1000, n_recordings=20)
+    told = with_recordings(whole, held, [50] * 20, 0.01, None)
+    possible = {cell for fault in told.possible for cell in fault.cells}
+    assert possible | set(told.fault_set) == set(cells)
+    assert not (told.verdicts[cells] == Verdict.ALIVE).any()
+    assert bool(untested(told)) == bool(possible)
+    assert all("perhaps" in fault.reason for fault in told.possible)
 
 
 def test_each_recording_has_verdicts_of_its_own(diagnosis, grasps):

@@ -14,12 +14,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from adaptfault.data.printable import printable
 from adaptfault.data.recordings.errors import InputError, Problem
 
 Shape = tuple[int, int, int]
 
-DECLARED = "wiring", "groups", "axes", "rest"
+DECLARED = "wiring", "groups", "axes", "rest", "device"
 """What readings do not show of a layout."""
+
+_LONGEST_NAME = 60  # letters of the name of a device
 
 BLOCK = 4096
 """Frames that are read at once."""
@@ -88,6 +91,14 @@ class Facts:
     problems: tuple[Problem, ...] = ()
     sizes: tuple[tuple[int, ...], ...] = ()
     places: NDArray[np.intp] | None = None
+
+    @property
+    def device(self) -> str | None:
+        """Which specimen it is, as a name of its own or a number."""
+        stated = self.declared.get("device")
+        if isinstance(stated, bool) or not isinstance(stated, str | int):
+            return None
+        return printable(str(stated).strip())[:_LONGEST_NAME].replace("\n", " ") or None
 
 
 @dataclass(frozen=True, eq=False)

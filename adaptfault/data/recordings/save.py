@@ -58,7 +58,7 @@ def save(
         raise InputError.at(path, "only CSV files have times to write; name a folder")
     lost: tuple[str, ...] = () if recordings.targets is None else ("the targets of a regression",)
     if path.suffix.lower() in (".npy", ".bag") and set(DECLARED) & set(recordings.layout.to_dict()):
-        lost = ("wiring, groups, axes and rest", *lost)
+        lost = ("wiring, groups, axes, rest and device", *lost)
     match path.suffix.lower():
         case ".npz":
             save_npz(path, recordings)

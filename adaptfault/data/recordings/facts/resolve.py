@@ -116,6 +116,9 @@ def resolve_layout(
         unknown = [name for name in ("full_scale", "rate") if not (overrides[name] or stated[name])]
         inferred += _lost(contents, unknown)
     stated |= {name: value for name, value in overrides.items() if value is not None}
+    if not isinstance(array, SensorLayout):
+        stated["device"], several = _device(contents)
+        problems += several
     if stated["full_scale"] is None:
         if tables is not None:
             stated["unit"] = stated["unit"] or "N"
@@ -152,6 +155,19 @@ def resolve_layout(
         inferred.append(f"rate {layout.rate:g} Hz ({reason_of_rate}); otherwise give --rate")
     problems += [] if tables is not None else _contradicted(contents, layout)
     return Resolved(layout, tuple(inferred), tuple(problems))
+
+
+def _device(contents: Sequence[Content]) -> tuple[str | None, list[Problem]]:
+    """Return the device that the files state; None, and a warning where they state several."""
+    of: dict[str, Path] = {}
+    for content in contents:
+        if content.facts.device is not None:
+            of.setdefault(content.facts.device, content.path)
+    if len(of) < 2:
+        return next(iter(of), None), []
+    told = ", ".join(f"{device} ({path.name})" for device, path in of.items())
+    what = f"recordings of {len(of)} devices: {told}; cells are judged as of one, load them apart"
+    return None, [Problem("warning", what)]
 
 
 def _names(contents: Sequence[Content], cells: int) -> Sequence[str] | None:
@@ -278,13 +294,20 @@ def _disagrees(content: Content, name: str, came: object, expected: object) -> I
 
 
 def check_statements(content: Content, layout: SensorLayout, calibrated: bool) -> None:
-    """Raise InputError if a file states another full scale or rate than the layout."""
+    """Raise InputError if a file states another full scale, device or rate than the layout."""
     full_scale = None if calibrated else content.facts.full_scale
     if full_scale is not None and not math.isclose(full_scale, layout.full_scale, rel_tol=1e-3):
         came = f"full scale {full_scale:g} {content.facts.unit or ''}".rstrip()
         what = (
             f"{came} where {layout.full_scale:g} {layout.unit} is expected; use recordings of the"
             " same sensor"
+        )
+        raise InputError.at(content.path, what)
+    device = content.facts.device
+    if layout.device is not None and device not in (None, layout.device):
+        what = (
+            f"device {device} where {layout.device} is expected: recordings of another robot; use"
+            " recordings of the same sensor"
         )
         raise InputError.at(content.path, what)
     if content.rate is not None and not same_rate(content.rate, layout.rate):

@@ -49,6 +49,7 @@ _KEYS = (
     "rate",
     "unit",
     "layout",
+    "device",
 )
 _RATES = ("sampling_hz", "rate", "rate_hz", "rate_Hz")  # in the JSON file beside an archive
 _BITS = re.compile(r"\s*(\d{1,2})[ -]?bits?\b", re.ASCII)
@@ -68,11 +69,11 @@ def open(path: Path, *, shape: Shape | None = None, **stated: Any) -> list[Recor
     ``[n, T, D]``; optional ``lengths`` ``[n]`` (frames after them are padding; or the frames of all
     recordings stand one behind the other, ``[sum of lengths, D]``), ``labels`` ``[n]`` (numbers or
     text), ``class_names``, ``names`` ``[n]``, ``present`` or ``factory_mask`` (bool
-    ``[pads, rows, cols]``, True = a real cell), and the scalars ``full_scale``, ``rate``, ``unit``
-    and ``layout`` (JSON as uint8, with ``wiring``, ``groups``, ``axes`` and ``rest`` as in a layout
-    file). A JSON file of the same stem may give ``class_names`` (or ``classes``), ``sampling_hz``
-    (or ``rate``), ``full_scale`` (a number, or "12 bit") and ``unit``; the archive itself takes
-    precedence.
+    ``[pads, rows, cols]``, True = a real cell), and the scalars ``full_scale``, ``rate``, ``unit``,
+    ``device`` and ``layout`` (JSON as uint8, with ``wiring``, ``groups``, ``axes``, ``rest`` and
+    ``device`` as in a layout file). A JSON file of the same stem may give ``class_names`` (or
+    ``classes``), ``sampling_hz`` (or ``rate``), ``full_scale`` (a number, or "12 bit") and
+    ``unit``; the archive itself takes precedence.
 
     Args:
         path: the archive.
@@ -171,7 +172,7 @@ def _read(path: Path, given: Shape | None) -> _Archive:
         full_scale=_scalar(path, arrays, "full_scale", full_scale),
         rate=_scalar(path, arrays, "rate", rate),
         unit=unit or None,
-        declared=_declared(arrays.get("layout")),
+        declared=_declared(arrays.get("layout")) | _device(arrays.get("device")),
         stored=arrays["frames"].shape,
         problems=problems,
     )
@@ -189,6 +190,11 @@ def _declared(layout: NDArray[Any] | None) -> dict[str, Any]:
     if not isinstance(fields, dict):
         return {}
     return {name: fields[name] for name in DECLARED if name in fields}
+
+
+def _device(array: NDArray[Any] | None) -> dict[str, Any]:
+    """Return the device that an archive states, if it does."""
+    return {} if array is None or array.size != 1 else {"device": array.item()}
 
 
 def save_npz(path: str | PathLike[str], recordings: Recordings) -> None:

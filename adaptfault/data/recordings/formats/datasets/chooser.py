@@ -292,6 +292,7 @@ class _Chooser:
             full_scale=contents.positive(name, FULL_SCALES),
             unit=unit if isinstance(unit, str) and 0 < len(unit) <= _LONGEST_UNIT else None,
             rate=None if rate is None else rate * pads.steps,
+            declared=contents.declared(name),
             stored=tuple(map(int, contents.arrays[name].shape)),
             problems=tuple(self._told(part, pads)),
             inferred=tuple(dict.fromkeys(filter(None, told))),

@@ -29,9 +29,10 @@ TEXTS = "OSUT"
 RATES = ("rate", "fps", "hz", "sampling_rate", "sampling_hz", "frequency")
 FULL_SCALES = ("full_scale", "max_value")
 UNITS = ("unit", "units")
+DEVICES = ("device", "device_id", "robot", "robot_id", "serial", "serial_number")
 """Names of attributes, and of arrays that hold one value."""
 
-_SCALARS = (*RATES, *FULL_SCALES, *UNITS, *LABELS)
+_SCALARS = (*RATES, *FULL_SCALES, *UNITS, *DEVICES, *LABELS)
 
 
 class Array(Protocol):
@@ -102,6 +103,11 @@ class Contents:
                 if known.lower() in wanted and np.size(value) == 1:
                     return plain(np.asarray(value).item())
         return None
+
+    def declared(self, name: str) -> dict[str, Any]:
+        """Return what attributes declare of the layout: the device."""
+        device = self.attribute(name, DEVICES)
+        return {} if device is None else {"device": device}
 
     def positive(self, name: str, wanted: Sequence[str]) -> float | None:
         """Return an attribute that is a number above 0; None where there is none."""

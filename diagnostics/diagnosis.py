@@ -847,7 +847,7 @@ class SelfDiagnosis:
         held = self._held(log, tolerance, classes)
 
         def judged(some: RecordingBlocks) -> Diagnosis:
-            return self._judged(some, crosstalk, held.suspect.any(axis=0))
+            return self._judged(some, crosstalk, np.asarray(held.suspect.any(axis=0)))
 
         whole = judged(log)
         if self._of_log or self.reference_ is None:

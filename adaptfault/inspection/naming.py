@@ -22,7 +22,8 @@ from diagnostics.preprocessing.transport import TransportFault
 
 _PAD = re.compile(r"\bpad (\d+)\b")
 _NUMBERS = r"\d+(?: to \d+)?(?:, \d+(?: to \d+)?)*"
-_RECORDINGS = re.compile(rf"\brecording(s?) ({_NUMBERS})(?! (?:frame|reading))\b")
+# names hold such words themselves: "log.npz, recording 7", "7.csv"
+_RECORDINGS = re.compile(rf"(?<!, )\brecording(s?) ({_NUMBERS})(?! (?:frame|reading))\b(?!\.\w)")
 _NUMBERED = re.compile(r"(?P<word>[^\W\d_]+) (?P<number>\d+)")
 _DIVIDED = re.compile(r"[./]")
 

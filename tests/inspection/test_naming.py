@@ -51,6 +51,15 @@ def test_pads_and_recordings_of_a_sentence_are_called_by_their_names(sentence, t
     assert Naming(("left", "right"), EPISODES, (20, 20, 20)).text(sentence) == told
 
 
+@pytest.mark.parametrize("name", ["log.npz, recording {}", "episode {}", "{}.csv"])
+@given(st.sets(st.integers(0, 8), min_size=1).map(sorted))
+def test_a_sentence_that_has_the_names_stays_as_it_is(name: str, numbers):
+    naming = Naming((), tuple(name.format(i) for i in range(9)), (20,) * 9)
+    named = naming.text(f"is open (in recordings {', '.join(map(str, numbers))})")
+    assert naming.text(named) == named
+    assert all(name.format(number).split()[-1] in named for number in numbers)
+
+
 def test_recordings_that_are_files_are_called_so():
     naming = Naming((), ("a.csv", "b 2.csv", "c.csv"), (20, 20, 20))
     assert naming.text("in recordings 0 to 1, 2") == "in recordings a.csv to b 2.csv, c.csv"

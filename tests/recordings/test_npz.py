@@ -89,7 +89,7 @@ def test_an_archive_keeps_the_wiring(tmp_path, declared):
     frames = rng.integers(0, 700, (9, layout.n_cells)).astype(np.float32)
     assert save(tmp_path / "a.npz", Recordings((frames,), layout)) == ()
     assert load(tmp_path / "a.npz").recordings.layout == layout
-    assert "wiring, groups, axes and rest" in save(
+    assert "wiring, groups, axes, rest and device" in save(
         tmp_path / "a.npy", Recordings((frames,), layout)
     )
 

@@ -44,7 +44,7 @@ def guard(
     """Check the touch readings of a data set before training; raise where they are not fit for it.
 
     Findings that do not raise and are no mere notice come as a warning. What was not checked is in
-    :attr:`~adaptfault.inspection.findings.Findings.unchecked`.
+    ``unchecked`` of what is returned.
 
     Args:
         dataset: recordings; paths, as :func:`adaptfault.load` takes them; or a data set with the

@@ -1,9 +1,9 @@
 """Fits the model to fault-free recordings.
 
-Conditional means are cross-fitted: each recording is predicted by one that did not see it. The
-network learns with cells left out, as logs have faulty ones. Healthy logs that are held out tell
-how often each cell is odd, and the factor on the evidence of each way to fail: what it says of a
-healthy cell stays below certainty.
+Conditional means, networks and tables are cross-fitted: each recording is judged by what did not
+see it. The network learns with cells left out, as logs have faulty ones. Logs that are held out
+tell how often each healthy cell is odd, and with dead cells beside them the factor on the evidence
+of each way to fail: what it says of a healthy cell stays below certainty.
 """
 
 from __future__ import annotations
@@ -18,11 +18,12 @@ from diagnostics.evidence.reference import converter_step
 from diagnostics.layout import SensorLayout
 from diagnostics.model.conditional_mean import ConditionalMean, CrossFitted
 from diagnostics.model.judge import Model
-from diagnostics.model.predictor import Network, Predictor
+from diagnostics.model.predictor import CrossFittedNetwork, Network, Predictor
 from diagnostics.model.record import Array, Cells, Mask, Record, frames_of_piece, record_of
 from diagnostics.model.rest import fit_rest
 from diagnostics.model.symbols import (
     NOTHING,
+    CrossFittedFlatness,
     Flatness,
     Symbols,
     activity_of,
@@ -30,8 +31,11 @@ from diagnostics.model.symbols import (
     root_load,
 )
 from diagnostics.model.ways import WAYS
+from diagnostics.preprocessing.levels import FEWEST
 
 _FOLDS = 4
+_HALVES = 2  # of the folds: networks and tables without each
+_FEWER = 0.5  # of the steps of a network of half the recordings
 _LEFT_OUT = (
     0.0,
     0.04,
@@ -50,9 +54,10 @@ _OFTEN = 0.2
 _LOGS = 32
 _LENGTHS = (3, 6, 6, 6, 6, 6, 6, 40)  # recordings of a log
 _DEAD = (0.0, 0.04, 0.08, 0.16)  # shares of the cells that are dead in it
-_TAIL = 0.995
+_EXCEED = 0.1  # healthy cells of a log exceed the limit of all
 
 Recordings = Sequence[NDArray[np.floating]]
+Examples = tuple[Array, NDArray[np.int8]]
 
 
 @dataclass(frozen=True)
@@ -62,7 +67,7 @@ class _Reference:
     Attributes:
         recordings: ``[T, D]`` each.
         record: of all of them.
-        load, level: of the record, ``[n, D]``.
+        load, level, flat: of the record, ``[n, D]``.
         living: bool ``[D]``.
         fold: int, of each recording.
         means: without each of the folds.
@@ -72,9 +77,25 @@ class _Reference:
     record: Record
     load: Array
     level: NDArray[np.int8]
+    flat: NDArray[np.int8]
     living: Mask
     fold: Cells
     means: Sequence[ConditionalMean]
+
+    @property
+    def of_piece(self) -> Cells:
+        """Fold of each piece, int ``[n]``."""
+        return self.fold[self.record.recording]
+
+    def flatness(self, symbols: Symbols, chosen: Mask) -> Flatness:
+        """Return how flat the ``chosen`` pieces (bool ``[n]``) are."""
+        return Flatness.fit(
+            symbols.group(self.level[chosen]),
+            activity_of(self.level[chosen], self.flat[chosen], self.living),
+            self.flat[chosen],
+            before_of(self.flat, self.record)[chosen],
+            self.living,
+        )
 
 
 def fit_model(
@@ -87,10 +108,13 @@ def fit_model(
     """Fit to fault-free recordings ``[T, D]`` of loads or readings, NaN: missing.
 
     Args:
-        recordings: two at least.
+        recordings: eight at least, in which cells move.
         layout: of the array; ``full_scale`` is the highest reading that there is.
         dead: bool ``[D]``, cells that are dead in them.
         progress: receives the share of the work that is done.
+
+    Raises:
+        ValueError: too few recordings, or no cell moves in them.
     """
     rng = np.random.default_rng(0)
     recordings = [np.asarray(one, np.float32) for one in recordings]
@@ -100,47 +124,92 @@ def fit_model(
     record = record_of(recordings, length)
     ranges = np.fmax.reduce(record.high) - np.fmin.reduce(record.low)
     living = present & ~dead & (ranges > _LIVES * full)
+    if len(recordings) < FEWEST or not living.any():
+        raise ValueError(
+            f"engine='model' learns from {FEWEST} recordings or more in which cells move, got"
+            f" {len(recordings)} with {living.sum()} cells that do: use engine='events'"
+        )
     rest = fit_rest(record, full, converter_step(recordings, layout), layout.pad_of, living)
     above = rest.above(record, living)
     symbols = Symbols.fit(above, rest, living)
     load = root_load(above, rest)
     level = symbols.levels(record, above)
     flat = symbols.flat(record)
-    activity = activity_of(level, flat, living)
-    flatness = Flatness.fit(symbols.group(level), activity, flat, before_of(flat, record), living)
     fold = rng.permutation(len(recordings)) % min(_FOLDS, len(recordings))
     means = [
         ConditionalMean.fit(load[fold[record.recording] != k], layout, living)
         for k in range(fold.max() + 1)
     ]
-    reference = _Reference(recordings, record, load, level, living, fold, means)
+    reference = _Reference(recordings, record, load, level, flat, living, fold, means)
     whole = ConditionalMean.fit(load, layout, living)
     progress(0.1)
     predictor = Predictor.of(load, layout, living, whole)
-    inputs, levels = _examples(predictor, reference, rng)
-    predictor.network = Network.fit(inputs, levels, symbols.n)
+    examples = _examples(predictor, reference, rng)
+    network = Network.fit(*_together(examples), symbols.n)
+    progress(0.4)
+    held_out = _held_out(reference, symbols, examples)
     progress(0.5)
+    flatness = reference.flatness(symbols, np.ones(len(record), bool))
     model = Model.of(symbols, flatness, predictor, length, present, living)
-    predictor.mean = CrossFitted(means, fold[record.recording])
+    held_out.judge(model, reference.of_piece)
     model.odd = _odd(model, reference)
     progress(0.6)
-    model.highest, model.reached = _highest(model, reference, rng)
+    model.highest, model.reached = _highest(model, reference, held_out, rng)
     predictor.mean = whole
+    predictor.network = network
+    model.flatness = flatness
     progress(1.0)
     return model
 
 
+@dataclass(frozen=True)
+class _HeldOut:
+    """What is fitted without each fold: conditional means, and without each half: networks and
+    tables."""
+
+    means: Sequence[ConditionalMean]
+    networks: Sequence[Network]
+    tables: Sequence[Flatness]
+
+    def judge(self, model: Model, fold: Cells) -> None:
+        """Let a model judge pieces of these folds (int ``[n]``) by what has not seen them."""
+        half = fold % len(self.networks)
+        model.predictor.mean = CrossFitted(self.means, fold)
+        model.predictor.network = CrossFittedNetwork(self.networks, half)
+        model.flatness = CrossFittedFlatness(self.tables, half)
+
+
+def _held_out(reference: _Reference, symbols: Symbols, examples: Sequence[Examples]) -> _HeldOut:
+    """Return what is fitted without each fold, and without each half of them."""
+    half = reference.of_piece % _HALVES
+    networks = []
+    tables = []
+    for k in range(min(_HALVES, len(examples))):
+        others = [of_fold for i, of_fold in enumerate(examples) if i % _HALVES != k]
+        networks.append(Network.fit(*_together(others), symbols.n, _FEWER))
+        tables.append(reference.flatness(symbols, half != k))
+    return _HeldOut(reference.means, networks, tables)
+
+
+def _together(examples: Sequence[Examples]) -> Examples:
+    inputs = [of_fold[0] for of_fold in examples]
+    levels = [of_fold[1] for of_fold in examples]
+    return np.concatenate(inputs), np.concatenate(levels)
+
+
 def _examples(
     predictor: Predictor, reference: _Reference, rng: np.random.Generator
-) -> tuple[Array, NDArray[np.int8]]:
-    """Return inputs and levels that the network learns, ``[n, k]`` and int ``[n]``."""
+) -> list[Examples]:
+    """Return inputs and levels that the network learns, ``[n, k]`` and int ``[n]`` of each
+    fold."""
     record = reference.record
     load = reference.load
     cells = np.flatnonzero(reference.living)
     most = int(_EXAMPLES / len(cells) / len(reference.means) / len(_LEFT_OUT)) + 1
-    inputs = []
-    levels = []
+    examples = []
     for k, mean in enumerate(reference.means):
+        inputs = []
+        levels = []
         predictor.mean = mean
         mine = np.flatnonzero(reference.fold[record.recording] == k)
         part = rng.integers(0, len(_LEFT_OUT), len(mine))
@@ -159,7 +228,8 @@ def _examples(
             found = found[np.searchsorted(with_before, chosen)][:, cells]
             inputs.append(found.reshape(-1, found.shape[-1]))
             levels.append(reference.level[chosen][:, cells].ravel())
-    return np.concatenate(inputs), np.concatenate(levels)
+        examples.append((np.concatenate(inputs), np.concatenate(levels)))
+    return examples
 
 
 def _odd(model: Model, reference: _Reference) -> Array:
@@ -174,7 +244,9 @@ def _odd(model: Model, reference: _Reference) -> Array:
     return found
 
 
-def _highest(model: Model, reference: _Reference, rng: np.random.Generator) -> tuple[Array, int]:
+def _highest(
+    model: Model, reference: _Reference, held_out: _HeldOut, rng: np.random.Generator
+) -> tuple[Array, int]:
     """Return the evidence of each way that healthy cells reach, ``[ways, D]``, in logs that are
     held out, with dead cells beside, and the units of the longest log."""
     cells = np.flatnonzero(model.living)
@@ -192,12 +264,12 @@ def _highest(model: Model, reference: _Reference, rng: np.random.Generator) -> t
             for frames in log:
                 frames[:, cell] = value
         record = record_of(log, model.length)
-        fold = reference.fold[chosen][record.recording]
-        model.predictor.mean = CrossFitted(reference.means, fold)
+        held_out.judge(model, reference.fold[chosen][record.recording])
         evidence = model.judge_record(record).evidence
         healthy = np.setdiff1d(cells, dead)
         highest[:, healthy] = np.maximum(highest[:, healthy], evidence[:, healthy])
         every.append(evidence[:, healthy])
         longest = max(longest, len(record.units))
-    tail = np.quantile(np.concatenate(every, axis=1), _TAIL, axis=1)
+    reached = np.concatenate(every, axis=1)
+    tail = np.quantile(reached, 1 - _EXCEED / len(cells), axis=1)
     return np.maximum(highest, tail[:, None]).astype(np.float32), longest

@@ -26,12 +26,12 @@ from diagnostics.model.observed import Log, Observed
 from diagnostics.model.over_time import USUAL, Units
 from diagnostics.model.predictor import Predictor
 from diagnostics.model.record import Array, Cells, Mask, Record, record_of
-from diagnostics.model.symbols import NOTHING, Flatness, Symbols
+from diagnostics.model.symbols import NOTHING, CrossFittedFlatness, Flatness, Symbols
 from diagnostics.model.ways import WAYS, Way
 
 _SUSPECT = 3.0  # evidence of a fault with which a cell predicts no other
 _WORST = 0.5  # of the highest evidence: who leaves in one round
-_ROUNDS = 8
+_ROUNDS = 16
 _CERTAIN = 6.0  # evidence that a healthy cell does not reach
 _SAFETY = 1.5
 HELD = 3  # pieces at the end at one load: it may be stuck
@@ -85,7 +85,7 @@ class Model:
     """
 
     symbols: Symbols
-    flatness: Flatness
+    flatness: Flatness | CrossFittedFlatness
     predictor: Predictor
     length: int
     present: Mask
@@ -158,7 +158,7 @@ class Model:
         deciding = [i for i, way in enumerate(WAYS) if way.decides]
         ways = [WAYS[i] for i in deciding]
         holds = (log.run >= HELD) & (log.load[-1] > NOTHING)
-        moved = log.far.copy()
+        stays = ~(log.received & self.living)
         observed = self.observed(log, log.far & ~holds & self.living)
         for _ in range(_ROUNDS):
             known = observed.known
@@ -169,20 +169,35 @@ class Model:
             if suspect.any():
                 observed = self.observed(log, known & ~self._worst(suspect, known, evidence))
                 continue
-            joins = log.received & self.living & ~moved & (evidence < 0)
+            # a cell that a worse one of its pad had made look wrong comes back, but once only
+            misled = ~holds & ~self._worst_of_pad(~known, evidence)
+            joins = ~known & ~stays & ((evidence < 0) | misled)
             if not joins.any():
                 break
-            moved |= joins
+            stays |= joins
             observed = self.observed(log, known | joins)
         return observed
 
     def _worst(self, suspect: Mask, known: Mask, evidence: Array) -> Mask:
         """Return the suspects that none beside them exceeds."""
         worst = suspect & (evidence > _WORST * evidence[known].max())
+        found: Mask = worst & (evidence >= self._beside(known, evidence))
+        return found
+
+    def _worst_of_pad(self, some: Mask, evidence: Array) -> Mask:
+        """Return ``some`` of the cells, the one with the highest evidence of each pad, bool
+        ``[D]``."""
+        pad = self.predictor.pad
+        highest = np.full(pad.max() + 1, -np.inf, np.float32)
+        np.maximum.at(highest, pad[some], evidence[some])
+        found: Mask = some & (evidence >= highest[pad])
+        return found
+
+    def _beside(self, some: Mask, evidence: Array) -> Array:
+        """Return the highest evidence of ``some`` of the cells beside each one, ``[D]``."""
         beside = self.predictor.beside
-        counts = (beside >= 0) & known[beside]
-        others = np.where(counts, evidence[beside], -np.inf).max(axis=1, initial=-np.inf)
-        found: Mask = worst & (evidence >= others)
+        counts = (beside >= 0) & some[beside]
+        found: Array = np.where(counts, evidence[beside], -np.inf).max(axis=1, initial=-np.inf)
         return found
 
     @staticmethod

@@ -13,6 +13,7 @@ from diagnostics.model.rest import DITHER
 from diagnostics.model.symbols import (
     MOVES,
     NOTHING,
+    CrossFittedFlatness,
     Flatness,
     Symbols,
     activity_of,
@@ -61,8 +62,19 @@ class Log:
         low = self.value - symbols.tolerance
         high = self.value + symbols.tolerance
         self.holds = (record.low >= low) & (record.high <= high)
+        self._alone: Array | None = None
         at_end = np.logical_and.accumulate(np.flip(self.holds, 0), 0)
         self.run = at_end.sum(axis=0)
+
+    def alone(self, predictor: Predictor) -> Array:
+        """Return log P(observed level) ``[n, D]`` by what each cell read a piece ago, nobody
+        else."""
+        if self._alone is None:
+            nobody = np.zeros_like(self.received)
+            self._alone = self.likelihood(
+                predictor(self.load, self.load, self.record.first, nobody)
+            )
+        return self._alone
 
     def likelihood(self, levels: Array, lag: int = 0) -> Array:
         """Return log P of each piece from ``lag`` on by P(level) ``[n - lag, D, K]``: of the
@@ -78,10 +90,13 @@ class Observed:
     Attributes:
         levels: P(level) ``[n, D, K]``.
         of_level: log P(observed level) ``[n, D]``.
-        healthy: log P(observed level and flatness) ``[n, D]``.
+        of_flatness: log P(observed flatness | level, how many others move) ``[n, D]``.
+        alone: log P(observed level) ``[n, D]`` by the past of the cell, nobody else.
     """
 
-    def __init__(self, log: Log, known: Mask, predictor: Predictor, flatness: Flatness) -> None:
+    def __init__(
+        self, log: Log, known: Mask, predictor: Predictor, flatness: Flatness | CrossFittedFlatness
+    ) -> None:
         self.log = log
         self.known = known
         self.predictor = predictor
@@ -89,10 +104,9 @@ class Observed:
         self.levels = predictor(log.load, log.load, log.record.first, known)
         self.of_level = np.where(self._unwitnessed(), 0, log.likelihood(self.levels))
         self.group = log.symbols.group(log.level)
-        cells = np.arange(log.level.shape[1])
         activity = activity_of(log.level, log.flat, known)
-        given = flatness.given_others[cells, self.group, activity[:, None], log.flat]
-        self.healthy = self.of_level + given
+        self.of_flatness = flatness.of_others(self.group, activity, log.flat)
+        self.alone = log.alone(predictor)
 
     def _unwitnessed(self) -> Mask:
         """Return where a cell rests and nobody on its pad tells of a contact, bool ``[n, D]``: that
@@ -107,8 +121,7 @@ class Observed:
         """Return the log ratio ``[n, D]`` of how flat a piece is, given the one before, where a
         cell holds its value."""
         log = self.log
-        cells = np.arange(log.level.shape[1])
-        healthy = self.flatness.chain[cells, self.group, log.before, log.flat]
+        healthy = self.flatness.of_chain(self.group, log.before, log.flat)
         ratio = _LOOKS[int(dithers)][log.flat] - healthy
         found: Array = np.where(log.holds & (log.flat != MOVES), ratio, 0).astype(np.float32)
         return found

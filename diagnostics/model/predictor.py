@@ -21,6 +21,7 @@ from diagnostics.model.record import Array, Cells, Mask
 from diagnostics.model.symbols import NOTHING
 
 _GUESS = 0.002  # of a uniform distribution in any prediction: models err
+_BLUR = 0.02  # of a level that is one further up, or down
 _HIDDEN = (32, 32)
 _BATCH = 2048
 _STEPS = 1000
@@ -45,15 +46,18 @@ class Network:
     biases: tuple[Array, ...]
 
     @classmethod
-    def fit(cls, inputs: Array, level: NDArray[np.integer], n_levels: int) -> Network:
-        """Fit to inputs ``[n, k]`` and levels int ``[n]``; the same every time."""
+    def fit(
+        cls, inputs: Array, level: NDArray[np.integer], n_levels: int, most: float = 1.0
+    ) -> Network:
+        """Fit to inputs ``[n, k]`` and levels int ``[n]``; the same every time. ``most``: share of
+        the usual steps."""
         from sklearn.neural_network import MLPClassifier
 
         mean = inputs.mean(axis=0)
         deviation = inputs.std(axis=0) + np.float32(1e-6)
         z = (inputs - mean) / deviation
         rng = np.random.default_rng(0)
-        steps = int(np.clip(_EPOCHS * len(z) / _BATCH, 50, _STEPS))
+        steps = int(np.clip(_EPOCHS * len(z) / _BATCH, 50, most * _STEPS))
         fit = MLPClassifier(_HIDDEN, learning_rate_init=_RATE, alpha=1e-6, random_state=0)
         fit.batch_size = min(_BATCH, len(z))
         averaged: list[Array] = []
@@ -73,7 +77,7 @@ class Network:
         return cls(mean, deviation, tuple(layers[:half]), tuple(layers[half:]))
 
     def __call__(self, inputs: Array) -> Array:
-        """Return P(level) ``[n, K]``."""
+        """Return P(level) ``[..., K]`` of inputs ``[..., k]``."""
         hidden = (inputs - self.mean) / self.deviation
         for weight, bias in zip(self.weights[:-1], self.biases[:-1], strict=True):
             hidden = np.maximum(hidden @ weight + bias, 0)
@@ -81,6 +85,28 @@ class Network:
         logits -= logits.max(axis=-1, keepdims=True)
         found: Array = np.exp(logits)
         found /= found.sum(axis=-1, keepdims=True)
+        return found
+
+
+@dataclass(frozen=True)
+class CrossFittedNetwork:
+    """Networks of which none has learned from the recordings that it predicts.
+
+    Attributes:
+        networks: without each of the folds.
+        fold: int ``[n]``, of each piece.
+    """
+
+    networks: Sequence[Network]
+    fold: Cells
+
+    def __call__(self, inputs: Array) -> Array:
+        """Return P(level) ``[n, D, K]`` of inputs ``[n, D, k]``, of the first pieces."""
+        fold = self.fold[: len(inputs)]
+        found = np.zeros((*inputs.shape[:2], len(self.networks[0].biases[-1])), np.float32)
+        for k in np.unique(fold).tolist():
+            of_fold = fold == k
+            found[of_fold] = self.networks[k](inputs[of_fold])
         return found
 
 
@@ -104,7 +130,7 @@ class Predictor:
     beside: Cells
     usual: Array
     mean: ConditionalMean | CrossFitted
-    network: Network | None = None
+    network: Network | CrossFittedNetwork | None = None
 
     @classmethod
     def of(
@@ -164,10 +190,19 @@ class Predictor:
         """Return P(level) ``[n, D, K]``; arguments as for :meth:`inputs`."""
         if self.network is None:
             raise ValueError("the predictor has no network yet")
-        inputs = self.inputs(load, own, first, known)
-        found: Array = self.network(inputs.reshape(-1, inputs.shape[-1])).reshape(*load.shape, -1)
+        found: Array = self.network(self.inputs(load, own, first, known))
         found = (1 - _GUESS) * found + np.float32(_GUESS / found.shape[-1])
-        return found
+        return _blurred(found)
+
+
+def _blurred(p: Array) -> Array:
+    """Return probabilities of levels of which a share lies a level further up or down."""
+    found = (1 - 2 * _BLUR) * p
+    found[..., 1:] += _BLUR * p[..., :-1]
+    found[..., :-1] += _BLUR * p[..., 1:]
+    found[..., 0] += _BLUR * p[..., 0]
+    found[..., -1] += _BLUR * p[..., -1]
+    return found
 
 
 def _before(values: Array, first: Mask) -> Array:

@@ -6,7 +6,8 @@ For pad p and piece t, with r the rest of each cell::
                         cells of the pad (shorth, Andrews et al. 1972),
     w = 1 where it is narrow, 0 where it is twice as wide
 
-It is subtracted where the interval is narrow: no contact is so even. All cells of the pad tell,
+Cell i shows a share a_i of it, learned from the reference. It is subtracted where the interval is
+narrow: no contact is so even. All cells of the pad tell,
 constant ones as well: those that are trusted would be others once the offset is wrong.
 
 Not detected: an offset of a pad with few cells; one that comes with a contact of more than half of
@@ -28,6 +29,9 @@ _EVEN = 0.5  # of a negative offset: by which the cells that share it differ
 _NOISES = 3.0  # by which those that share a positive one differ; a contact may be even, too
 _RESTS = 0.25  # share of the recordings in which a cell rests at some time, at least
 _WIDER = 8.0  # than their interval is the spread of all, where these rest and others do not
+_ROUNDS = 3
+_SURE = 20.0  # pieces that a share of 1 is worth
+_MOST = 1.0  # share of the offset of a pad that a cell shows
 _UNSTEADY = 0.05  # of full scale: the rest of a cell differs between recordings by less
 
 
@@ -41,6 +45,7 @@ class Rest:
         full: highest reading that the reference shows, or full scale.
         high: ``[D]``, highest reading of each cell in the reference.
         pad: int ``[D]``, pad of each cell.
+        share: ``[D]``, of what its pad shares that each cell shows.
     """
 
     level: Array
@@ -48,15 +53,21 @@ class Rest:
     full: float
     high: Array
     pad: Cells
+    share: Array
 
     def offset(self, record: Record, telling: Mask) -> Array:
-        """Return the offset of each cell's pad in each piece, ``[n, D]``; ``telling``: bool
+        """Return what each cell shares with its pad in each piece, ``[n, D]``; ``telling``: bool
         ``[D]``, cells that are received and live."""
+        found: Array = self.share * self.of_pads(record, telling)
+        return found
+
+    def of_pads(self, record: Record, telling: Mask) -> Array:
+        """Return the offset of each cell's pad in each piece, ``[n, D]``."""
         found = np.zeros(record.mean.shape, np.float32)
         stuck = self._stuck(record)
         for pad in np.unique(self.pad).tolist():
             cells = self.pad == pad
-            tell = np.flatnonzero(cells & telling)
+            tell = np.flatnonzero(cells & telling & (self.share > _EVEN))
             live = tell[~stuck[tell]]
             if 2 * len(live) > len(tell):
                 tell = live
@@ -97,17 +108,34 @@ def fit_rest(record: Record, full: float, step: float, pad: Cells, living: Mask)
     level, _ = _lowest(record.mean, first, least)
     near = np.full_like(level, least)
     high = np.fmax.reduce(record.high)
-    rest = Rest(level, near, full, high, pad)
-    for _ in range(2):
-        without = record.mean - rest.offset(record, living)
+    share = np.ones_like(level)
+    rest = Rest(level, near, full, high, pad, share)
+    for _ in range(_ROUNDS):
+        share = _share(record, rest, living, least)
+        without = record.mean - share * rest.of_pads(record, living)
         level, spread = _lowest(without, first, least)
         range_ = record.high - record.low
         resting = np.where(without <= level + 2 * spread, range_, np.nan)
         noise = np.nan_to_num(np.nanmedian(resting, axis=0))
         unsteady = np.minimum(spread, _UNSTEADY * full)
         near = np.fmax(least, 2 * np.fmax(noise, unsteady)).astype(np.float32)
-        rest = Rest(level, near, full, high, pad)
+        rest = Rest(level, near, full, high, pad, share)
     return rest
+
+
+def _share(record: Record, rest: Rest, living: Mask, least: float) -> Array:
+    """Return the share of the offset of its pad that each cell shows, ``[D]``: least squares over
+    the pieces in which it is not loaded, shrunk to 1; ``least``: a smaller offset tells nothing."""
+    offset = rest.of_pads(record, living)
+    above = record.mean - rest.level
+    resting = np.abs(above) <= rest.near + 2 * np.abs(offset)
+    tells = resting & (np.abs(offset) > least)
+    x = np.where(tells, offset, 0).astype(np.float64)
+    y = np.where(tells, above, 0)
+    prior = _SURE * rest.near.astype(np.float64) ** 2
+    slope = ((x * y).sum(axis=0) + prior) / ((x * x).sum(axis=0) + prior)
+    found: Array = np.clip(slope, 0, _MOST).astype(np.float32)
+    return found
 
 
 def _lowest(readings: Array, first: Cells, least: float) -> tuple[Array, Array]:

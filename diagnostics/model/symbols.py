@@ -5,6 +5,7 @@ Levels are 0 rest, quantiles of the loads of the reference, the top, and what is
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -123,6 +124,43 @@ class Flatness:
         chain = np.zeros_like(given)
         np.add.at(chain, (cell, group, before, flat), 1)
         return cls(_shrunk(given, living), _shrunk(chain, living))
+
+    def of_others(self, group: Cells, activity: Cells, flat: NDArray[np.int8]) -> Array:
+        """Return log P(flat | group, activity of the others ``[n]``), ``[n, D]``."""
+        cells = np.arange(flat.shape[1])
+        found: Array = self.given_others[cells, group, activity[:, None], flat]
+        return found
+
+    def of_chain(self, group: Cells, before: NDArray[np.int8], flat: NDArray[np.int8]) -> Array:
+        """Return log P(flat | group, flatness a piece ago), ``[n, D]``."""
+        cells = np.arange(flat.shape[1])
+        found: Array = self.chain[cells, group, before, flat]
+        return found
+
+
+@dataclass(frozen=True)
+class CrossFittedFlatness:
+    """Tables of which none has counted the recordings that it judges.
+
+    Attributes:
+        tables: without each of the folds.
+        fold: int ``[n]``, of each piece.
+    """
+
+    tables: Sequence[Flatness]
+    fold: Cells
+
+    def of_others(self, group: Cells, activity: Cells, flat: NDArray[np.int8]) -> Array:
+        """Return log P(flat | group, activity of the others ``[n]``), ``[n, D]``."""
+        each = [table.of_others(group, activity, flat) for table in self.tables]
+        found: Array = np.stack(each)[self.fold, np.arange(len(flat))]
+        return found
+
+    def of_chain(self, group: Cells, before: NDArray[np.int8], flat: NDArray[np.int8]) -> Array:
+        """Return log P(flat | group, flatness a piece ago), ``[n, D]``."""
+        each = [table.of_chain(group, before, flat) for table in self.tables]
+        found: Array = np.stack(each)[self.fold, np.arange(len(flat))]
+        return found
 
 
 def _shrunk(count: NDArray[np.float64], living: Mask) -> Array:

@@ -87,6 +87,16 @@ def test_a_cell_that_moves_by_itself_floats(fitted, healthy):
     assert fault.kind is FaultKind.FLOATING
 
 
+def test_a_cell_that_reads_the_loads_of_another_time_floats_and_those_beside_it_are_alive(fitted):
+    log = presses(2, 30)
+    for frames, other in zip(log, presses(6, 30), strict=True):
+        frames[:, 27] = other[:, 27]
+    diagnosis = fitted.diagnose(log)
+    assert set(diagnosis.fault_set) == {27}
+    beside = [diagnosis.verdicts[cell] for cell in (19, 26, 28, 35)]
+    assert set(beside) == {Verdict.ALIVE}
+
+
 def test_a_cell_that_is_dead_in_every_second_recording_is_told_with_these(fitted):
     log = presses(2, 30)
     for frames in log[::2]:
@@ -153,6 +163,15 @@ def test_the_same_recordings_give_the_same_model(model, healthy):
     np.testing.assert_array_equal(
         again.judge(healthy).probability, model.judge(healthy).probability
     )
+
+
+@pytest.mark.parametrize(
+    ("reference", "got"),
+    [(presses(0, 7), "got 7 with 64 cells"), ([np.full((60, 64), REST)] * 12, "12 with 0 cells")],
+)
+def test_a_reference_that_shows_too_little_is_refused_with_what_it_shows(reference, got):
+    with pytest.raises(ValueError, match=got):
+        SelfDiagnosis(LAYOUT, engine="model").fit(reference)
 
 
 def test_an_unknown_engine_is_refused_with_those_there_are():

@@ -1,5 +1,8 @@
-"""Moves, but not with the others: P(level, flatness) is that of the cell's own pieces, this one
-left out.
+"""Moves, but not with the others.
+
+P(level, flatness) is half that of the cell's own pieces, this one left out, and half what its own
+past says, as the predictor knows it: a load that a cell reads now it will read a piece later, dead
+or not, and only what the others say tells the two apart.
 
 Not detected: what moves so little that it reads as at rest; a copy of a cell that the others
 predict.
@@ -30,7 +33,9 @@ def _ratio(observed: Observed) -> Array:
     of_cell = symbol + kinds * np.arange(d)
     count = np.bincount(of_cell.ravel(), minlength=kinds * d)[of_cell] - 1
     own = (count + _WEIGHS / kinds + _LEAST) / (n - 1 + _WEIGHS + _LEAST * kinds)
-    found: Array = np.log(own) - np.where(rests, observed.of_level, observed.healthy)
+    of_flatness = np.where(rests, 0, observed.of_flatness)
+    either = np.logaddexp(np.log(own), observed.alone + of_flatness) - np.log(2)
+    found: Array = either - observed.of_level - of_flatness
     return found * log.record.received
 
 

@@ -26,7 +26,7 @@ CODES: tuple[Code, ...] = (
     Code(
         101,
         FaultKind.OPEN,
-        "A cell or a wire reads what an untouched one reads, whatever touches it.",
+        "A cell or a wire reads what an untouched one reads, whatever the contact.",
         _DEAD,
         "A cell that is touched nowhere in the data set looks the same, and is told as not tested.",
         _STILL,
@@ -34,7 +34,7 @@ CODES: tuple[Code, ...] = (
     Code(
         102,
         FaultKind.SHORT,
-        "A cell or a wire reads full scale, whatever touches it.",
+        "A cell or a wire reads full scale, whatever the contact.",
         "It dominates every mean and maximum of its pad.",
         "Full scale has to be right: --full-scale.",
         _STILL,
@@ -51,7 +51,7 @@ CODES: tuple[Code, ...] = (
         104,
         FaultKind.ALIAS,
         "A row, a column or a cell reads another one: an address bit or a bridge.",
-        "A contact appears twice, at places that one finger never touches together.",
+        "A contact appears twice, at places that one finger never reaches together.",
         "Lines that every contact loads alike cannot be told apart.",
         "Lines that agree in the reference as well.",
     ),
@@ -82,7 +82,7 @@ CODES: tuple[Code, ...] = (
     Code(
         108,
         FaultKind.FLOATING,
-        "A cell or a wire moves by itself, whatever touches it: a broken wire of high impedance.",
+        "A cell or a wire moves by itself, whatever the contact: a broken wire of high impedance.",
         "It looks alive in every statistic of its own, and carries a signal of something else.",
         "It is told against what the other cells say, so these must work.",
         _MOVING,
@@ -99,7 +99,7 @@ CODES: tuple[Code, ...] = (
         110,
         FaultKind.COPY,
         "A cell repeats another one, or the mean of those beside it.",
-        "A contact is counted twice, and nobody sees what touches the cell itself.",
+        "A contact is counted twice, and nobody sees the load of the cell itself.",
         "Cells in a dead band that flicker to the same value are none.",
         "A copy of a cell that is loaded like its own in every contact.",
     ),
@@ -291,7 +291,7 @@ CODES: tuple[Code, ...] = (
         142,
         "repeated_frames",
         "The logger is faster than the sensor: most frames repeat the one before.",
-        "The rate of touch is a part of the stated one; windows hold fewer readings than they say.",
+        "The true rate is a part of the stated one; windows hold fewer readings than they say.",
         "Looked for in 64 recordings at most.",
         method="diagnostics.sensor.repeated_frames",
     ),
@@ -316,7 +316,7 @@ CODES: tuple[Code, ...] = (
         "sentinel",
         "One number outside the range stands where the driver has no value.",
         "It sets the range that every policy normalises with.",
-        "A number within the range cannot be told from a reading.",
+        "A number within the range looks like a reading.",
         "Several such numbers, where none of them is the most frequent by far.",
     ),
     Code(
@@ -384,7 +384,7 @@ CODES: tuple[Code, ...] = (
     Code(
         163,
         "tared_in_contact",
-        "Readings fall below rest, as after a tare in contact.",
+        "Readings fall below rest, as after zeroing in contact.",
         "The same contact has another value in these recordings.",
         "Needs three recordings.",
         method="adaptfault.inspection.data_set",
@@ -403,7 +403,7 @@ CODES: tuple[Code, ...] = (
         "untested",
         "So few cells were tested that faults may be hidden, or none of a pad.",
         "What was not tested is not healthy.",
-        "Touches that would test more are told.",
+        "Contacts that would test more are told.",
         "What contacts a policy will meet that the data set does not hold.",
     ),
     Code(
@@ -412,6 +412,6 @@ CODES: tuple[Code, ...] = (
         "Files or recordings could not be read, and were left out.",
         "What was not read was not checked.",
         "The errors above name each with the reason.",
-        "Files whose suffix no reader knows.",
+        "Files with a suffix that no reader has.",
     ),
 )

@@ -10,7 +10,7 @@ mean over the cells of the readings minus s, signed so that load rises, L the me
 recordings of the lowest l_i, and p that of the highest minus the lowest, a recording begins in
 contact where l_i(0) exceeds L by 30 % of p. It was tared in contact where it begins at L, and goes
 10 % of p below: of three recordings or more, most of which begin at their lowest. Recordings agree
-more in what they read without load than with it, which shows the sign. Not detected: a tare in
+more in what they read without load than with it, which shows the sign. Not detected: zeroing in
 contact whose readings are cut off at 0, and one where most recordings begin in contact.
 """
 

@@ -626,6 +626,8 @@ class SelfDiagnosis:
             pulled = self._pulled(stream, life, causes, inferred)
             causes = pulling(causes, pulled[self._place], self.layout)
         shown = (life.shown | (stream.reference.dead > 0)) & ~pulled
+        if self._of_log or self.reference_ is None:
+            shown &= reads_enough(stream.ranges, self._planes)
         if stream.crosstalk is not None:
             shown &= stream.crosstalk.own
         scale = stream.scale
@@ -850,10 +852,6 @@ class SelfDiagnosis:
             return self._judged(some, crosstalk, np.asarray(held.suspect.any(axis=0)))
 
         whole = judged(log)
-        if self._of_log or self.reference_ is None:
-            spans = Spans.of(RecordingBlocks(self._in_planes(log)))
-            enough = reads_enough(spans, self._planes)[self._place]
-            whole = replace(whole, tested=whole.tested & (enough | whole.fault_set.mask))
         if self.reference_ is None or len(log) < 2:
             return whole
         return with_recordings(

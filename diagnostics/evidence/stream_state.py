@@ -142,6 +142,8 @@ class StreamState:
         self._response = WeakResponse.begin(layout.n_cells)
         self._level = RestLevel.begin(layout.n_cells)
         self.life = LifeRecord()
+        self._least = np.full(layout.n_cells, np.nan)
+        self._most = np.full(layout.n_cells, np.nan)
         self.crosstalk: Crosstalk | None = None
         self.held = np.zeros(layout.n_cells, bool)
         self._of_pad = PadLevel.begin(layout.n_cells)
@@ -176,6 +178,8 @@ class StreamState:
         if wrong is not None:
             frames = np.where(wrong, np.nan, frames)
             self.transport = self.transport.dropped(wrong)
+        self._least = np.fmin(self._least, np.fmin.reduce(frames, axis=0, initial=np.nan))
+        self._most = np.fmax(self._most, np.fmax.reduce(frames, axis=0, initial=np.nan))
         before = self.transport.seen
         self.transport, new = self.transport.receive(frames, self.present, self._patience)
         completed = False
@@ -337,6 +341,12 @@ class StreamState:
         return self._models.setdefault(
             i, _on_rectangle(known.of_tile(i, own.cells, own.layout).predict, own)
         )
+
+    @property
+    def ranges(self) -> NDArray[np.float64]:
+        """Highest minus lowest reading of each cell, ``[D]``; 0: none."""
+        found: NDArray[np.float64] = np.nan_to_num(self._most - self._least)
+        return found
 
     @property
     def lowest(self) -> NDArray[np.float64]:

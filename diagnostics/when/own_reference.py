@@ -21,7 +21,6 @@ from diagnostics.preprocessing.levels import MAJORITY
 from diagnostics.preprocessing.quantiles import known_quantile
 from diagnostics.preprocessing.readings import RecordingBlocks
 from diagnostics.when.held import Held
-from diagnostics.when.spans import Spans
 
 if TYPE_CHECKING:
     from diagnostics.layout import SensorLayout
@@ -51,21 +50,15 @@ def own_reference(log: RecordingBlocks, held: Held, classes: ArrayLike | None) -
     return sorted(chosen)
 
 
-def reads_enough(spans: Spans, layout: SensorLayout) -> NDArray[np.bool_]:
-    """Return the cells that move at least half as far as those beside them in some recording in
-    which these move at least half as far as they ever do, bool ``[D]``.
+def reads_enough(ranges: NDArray[np.float64], layout: SensorLayout) -> NDArray[np.bool_]:
+    """Return the cells that move at least half as far as those beside them, bool ``[D]``.
 
     Args:
-        spans: of the recordings.
+        ranges: highest minus lowest reading of each cell, ``[D]``.
         layout: the array.
     """
-    present = layout.present.ravel()
-    on = (layout.beside >= 0) & present[layout.beside]
-    moves = np.where(spans.known & present, spans.ranges, np.nan)
-    beside = np.stack(
-        [known_quantile(np.where(on, one[layout.beside], np.nan), 0.5, axis=1) for one in moves]
-    )
-    beside = np.nan_to_num(beside)  # where there are none, nothing contradicts
-    far = beside >= MAJORITY * beside.max(axis=0)
-    found: NDArray[np.bool_] = (far & (spans.ranges >= MAJORITY * beside)).any(axis=0)
+    on = (layout.beside >= 0) & layout.present.ravel()[layout.beside]
+    beside = known_quantile(np.where(on, ranges[layout.beside], np.nan), MAJORITY, axis=1)
+    # where there are none, nothing contradicts
+    found: NDArray[np.bool_] = ranges >= MAJORITY * np.nan_to_num(beside)
     return found

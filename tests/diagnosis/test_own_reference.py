@@ -10,8 +10,7 @@ from hypothesis import strategies as st
 from adaptfault.data.simulated_grasps import simulate
 from diagnostics import Fault, FaultKind, SelfDiagnosis, SensorLayout, Verdict, inject
 from diagnostics.decision.calibration import Calibrator
-from diagnostics.preprocessing.readings import RecordingBlocks
-from diagnostics.when import OWN_REFERENCE, Spans, reads_enough
+from diagnostics.when import OWN_REFERENCE, reads_enough
 
 LAYOUT = SensorLayout(1, 8, 8)
 FAILS = 25  # recording from which on cells are dead
@@ -65,7 +64,7 @@ def test_of_a_healthy_log_no_cell_is_blamed_and_most_are_alive(grasps, own):
     assert not diagnosis.faults
     alive = (diagnosis.verdicts == Verdict.ALIVE).reshape(8, 8)
     assert alive[1:-1, 1:-1].all()
-    assert alive.mean() > 0.8  # contacts hardly touch the edges: these may be worn
+    assert alive.mean() > 0.7  # contacts hardly touch the edges: these may be worn
 
 
 def test_a_shorter_log_is_no_reference(grasps):
@@ -178,7 +177,7 @@ def test_a_worn_cell_never_reads_enough(grasps, row: int, column: int, gain: flo
     cell = LAYOUT.cell(0, row, column)
     rng = np.random.default_rng(n)
     log = [one + noise * rng.normal(size=one.shape) for one in worn(grasps[:n], [cell], gain)]
-    enough = reads_enough(Spans.of(RecordingBlocks(log)), LAYOUT)
+    enough = reads_enough(np.ptp(np.concatenate(log), axis=0), LAYOUT)
     assert not enough[cell]
 
 

@@ -27,6 +27,8 @@ from adaptfault.inspection.inspection import Finding, Inspection
 from adaptfault.inspection.severity import of_finding
 from diagnostics import SensorLayout, Verdict
 from diagnostics.preprocessing.levels import LIGHT, LOW
+from diagnostics.preprocessing.readings import RecordingBlocks
+from diagnostics.when import Spans
 from diagnostics.when.recording_numbers import ranges
 
 _RECORDINGS = 3  # with the same value; of few counts, two agree by chance
@@ -52,10 +54,11 @@ class HeldValues:
     @classmethod
     def of(cls, recordings: Iterable[NDArray[Any]], layout: SensorLayout) -> HeldValues:
         """Return the held values of recordings, ``[T, D]`` each, read once."""
-        extremes = [_extremes(np.asarray(frames, np.float64)) for frames in recordings]
-        low = np.stack([lowest for lowest, _ in extremes])
-        high = np.stack([highest for _, highest in extremes])
-        known = np.isfinite(low) & layout.present.ravel()
+        each = (Spans.of(RecordingBlocks([np.asarray(one, np.float64)])) for one in recordings)
+        spans = Spans.joined(list(each))
+        low = spans.low
+        high = spans.high
+        known = spans.known & layout.present.ravel()
         if not known.any():
             return cls(np.zeros(low.shape, bool), low)
         rest = _rest(low, high, known)
@@ -102,11 +105,6 @@ def with_held_values(
     )
     told = Finding("held_value", of_finding("held_value"), reason)
     return replace(inspection, readings=readings, findings=(*inspection.findings, told))
-
-
-def _extremes(frames: Floats) -> tuple[Floats, Floats]:
-    """Return the lowest and the highest reading of each cell; NaN where it has none."""
-    return np.fmin.reduce(frames, axis=0), np.fmax.reduce(frames, axis=0)
 
 
 def _rest(low: Floats, high: Floats, known: Bools) -> Floats:

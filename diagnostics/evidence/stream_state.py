@@ -142,8 +142,7 @@ class StreamState:
         self._response = WeakResponse.begin(layout.n_cells)
         self._level = RestLevel.begin(layout.n_cells)
         self.life = LifeRecord()
-        self._least = np.full(layout.n_cells, np.nan)
-        self._most = np.full(layout.n_cells, np.nan)
+        self._highest = np.full(layout.n_cells, np.nan)
         self.crosstalk: Crosstalk | None = None
         self.held = np.zeros(layout.n_cells, bool)
         self._of_pad = PadLevel.begin(layout.n_cells)
@@ -178,8 +177,6 @@ class StreamState:
         if wrong is not None:
             frames = np.where(wrong, np.nan, frames)
             self.transport = self.transport.dropped(wrong)
-        self._least = np.fmin(self._least, np.fmin.reduce(frames, axis=0, initial=np.nan))
-        self._most = np.fmax(self._most, np.fmax.reduce(frames, axis=0, initial=np.nan))
         before = self.transport.seen
         self.transport, new = self.transport.receive(frames, self.present, self._patience)
         completed = False
@@ -345,7 +342,7 @@ class StreamState:
     @property
     def ranges(self) -> NDArray[np.float64]:
         """Highest minus lowest reading of each cell, ``[D]``; 0: none."""
-        found: NDArray[np.float64] = np.nan_to_num(self._most - self._least)
+        found: NDArray[np.float64] = np.nan_to_num(self._highest - self.lowest)
         return found
 
     @property
@@ -566,6 +563,7 @@ class StreamState:
         numbers = self._numbers[: self._filled]
         begins = self._begins[: self._filled]
         self._filled = 0
+        self._highest = np.fmax(self._highest, np.fmax.reduce(frames))
         self._offsets = self._offsets.extend(
             frames, self.reference.scale, self.present, self.reference.offset
         )

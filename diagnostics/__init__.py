@@ -11,7 +11,7 @@ __path__ = extend_path(__path__, __name__)  # adaptfault-bench adds the circuit
 from diagnostics.decision.certificate import Certificate
 from diagnostics.decision.coverage import Coverage
 from diagnostics.decision.result import Diagnosis, Verdict
-from diagnostics.decision.static_loads import StaticLoad
+from diagnostics.decision.static_load import StaticLoad
 from diagnostics.diagnosis import SelfDiagnosis
 from diagnostics.faults import Fault, FaultKind, FaultSet
 from diagnostics.layout import SensorLayout

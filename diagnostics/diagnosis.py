@@ -32,7 +32,8 @@ from diagnostics.decision.serialization import (
     to_state,
     write_state,
 )
-from diagnostics.decision.static_loads import StaticLoad, find_static_loads
+from diagnostics.decision.static_load import StaticLoad
+from diagnostics.decision.static_loads import find_static_loads
 from diagnostics.events.constant_runs import SHORTEST_RUN
 from diagnostics.evidence.life import PIECE, Life
 from diagnostics.evidence.life.pulled_lines import pulled_lines

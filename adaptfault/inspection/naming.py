@@ -17,7 +17,7 @@ from adaptfault.data.recordings import Opened, Recordings
 from adaptfault.data.recordings.formats.datasets.features import common_features
 from adaptfault.inspection.inspection import Finding, Inspection
 from diagnostics import Diagnosis, Fault, SensorLayout
-from diagnostics.decision.static_loads import StaticLoad
+from diagnostics.decision.static_load import StaticLoad
 from diagnostics.preprocessing.transport import TransportFault
 
 _PAD = re.compile(r"\bpad (\d+)\b")

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from diagnostics.decision.coverage import Coverage, coverage
 from diagnostics.decision.numbering import Numbering
-from diagnostics.decision.static_loads import StaticLoad
+from diagnostics.decision.static_load import StaticLoad
 from diagnostics.faults import Fault, FaultKind, FaultSet
 from diagnostics.layout import SensorLayout
 from diagnostics.preprocessing.transport import TransportFault

@@ -82,10 +82,9 @@ from diagnostics.when.reference_findings import (
     reference_findings,
 )
 
-SCHEMA = "adaptfault.diagnoser/1"
+SCHEMA = "adaptfault.diagnoser/2"
 
 # P(faulty) of silent, intermittent, noisy and drifting cells, which have their own thresholds
-_WHOLE_LOGS = "engine='model' judges whole logs and is not stored"
 _ENGINES = ("events", "model")
 _WHOLE = 1e-6  # by which a whole number may be missed after a conversion to loads and back
 _CERTAIN = 1 - RARE
@@ -103,6 +102,7 @@ class Fitted:
     reference: Reference | None
     load: LoadDirection | None = None
     certificate: Certificate | None = None
+    model: Model | None = None
 
 
 def _no_progress(share: float) -> None:
@@ -119,8 +119,7 @@ class SelfDiagnosis:
             others as a healthy cell does (:mod:`diagnostics.evidence.life`), so that dead cells
             that move are found. Without it, what moves counts as alive.
         engine: ``"events"``, or ``"model"``: the one model of the array in time
-            (:mod:`diagnostics.model`), which is to replace it. It judges whole logs with a
-            reference; it tells no objects that lie still, and is not stored.
+            (:mod:`diagnostics.model`), which is to replace it; it needs a reference.
 
     Attributes:
         reference_: the healthy reference, after :meth:`fit`; None: cold start.
@@ -478,12 +477,7 @@ class SelfDiagnosis:
     def state(self) -> tuple[dict[str, Any], Arrays]:
         """Return the fitted state: a JSON-safe dict and arrays by name, as :meth:`from_state` reads
         them.
-
-        Raises:
-            ValueError: ``engine="model"``.
         """
-        if self.engine == "model":
-            raise ValueError(f"{_WHOLE_LOGS}: use engine='events' to store it")
         fitted, arrays = to_state(
             Fitted(
                 self.layout,
@@ -492,6 +486,7 @@ class SelfDiagnosis:
                 self.reference_,
                 self.load_,
                 self._certificate,
+                self._model,
             )
         )
         return {"schema": SCHEMA, **fitted}, arrays
@@ -513,6 +508,8 @@ class SelfDiagnosis:
             diagnoser.reference_ = fitted.reference
             diagnoser.load_ = fitted.load
             diagnoser._certificate = fitted.certificate
+            diagnoser._model = fitted.model
+            diagnoser.engine = "events" if fitted.model is None else "model"
             if fitted.load is not None:
                 fitted.load.check(fitted.layout)
             if fitted.reference is not None:
@@ -550,7 +547,8 @@ class SelfDiagnosis:
         reference = self.reference_ or Reference.unknown(self._planes)
         exclusion = self.calibrator_.exclusion if reference.model else Exclusion()
         order = self._order if self.layout.axes > 1 else None
-        return StreamState(self._planes, reference, exclusion, needed, self.load_, order)
+        recorder = None if self._model is None else self._model.recorder()
+        return StreamState(self._planes, reference, exclusion, needed, self.load_, order, recorder)
 
     def evaluate(
         self, stream: StreamState, *, n_recordings: int = 1, life: Life | None = None
@@ -564,18 +562,18 @@ class SelfDiagnosis:
                 of a shorted crossing tested; None: they are.
 
         Raises:
-            ValueError: no frame with a reading was received yet; ``engine="model"``.
+            ValueError: no frame with a reading was received yet.
         """
         with one_thread():
             return self._evaluated(stream, n_recordings, life)
 
     def _evaluated(self, stream: StreamState, n_recordings: int, life: Life | None) -> Diagnosis:
         """Return the diagnosis; arguments as in :meth:`evaluate`."""
-        if self._model is not None:
-            raise ValueError(f"{_WHOLE_LOGS}; got a stream: use diagnose, or engine='events'")
         stream = stream.complete()
         if not stream.received.any():
             raise ValueError("the recordings hold no frame with a reading: nothing to diagnose")
+        if self._model is not None:
+            return self._diagnosed_by_model(self._model, stream, n_recordings)
         aliases, copies = find_aliasing(stream)
         explained = copies
         still = list[StaticLoad]()
@@ -801,17 +799,13 @@ class SelfDiagnosis:
             stream.begin_recording()
             for frames in log[i : i + 1].blocks():
                 stream.extend(frames)
-        if self._model is not None:
-            return self._diagnosed_by_model(self._model, log, stream.complete())
         return self.evaluate(stream, n_recordings=len(log))
 
     def _diagnosed_by_model(
-        self, model: Model, log: RecordingBlocks, stream: StreamState
+        self, model: Model, stream: StreamState, n_recordings: int
     ) -> Diagnosis:
-        """Return what the model says of a log, whose ``stream`` tells what is lost on the way."""
-        if not stream.received.any():
-            raise ValueError("the recordings hold no frame with a reading: nothing to diagnose")
-        judgement = model.judge(self._in_planes(log))
+        """Return what the model says of the log behind a ``stream``."""
+        judgement = model.judge_record(stream.record())
         full_scale = self.layout.full_scale
         found = findings(judgement, stream, full_scale, self.false_discovery_rate)
         aliases, _ = find_aliasing(stream)
@@ -835,7 +829,7 @@ class SelfDiagnosis:
             ),
             evidence=evidence,
             n_frames=stream.transport.seen,
-            n_recordings=len(log),
+            n_recordings=n_recordings,
             possible=possible,
             contradicting=judgement.disturbed,
         )

@@ -49,13 +49,9 @@ class Monitor:
     Args:
         fitted: a fitted :class:`SelfDiagnosis`; an unfitted one is a cold start.
 
-    Raises:
-        ValueError: its engine judges whole logs.
     """
 
     def __init__(self, fitted: SelfDiagnosis) -> None:
-        if fitted.engine == "model":
-            raise ValueError("engine='model' judges whole logs: monitor with engine='events'")
         import scipy.ndimage  # imported here, not in the control loop
         import scipy.optimize  # noqa: F401
 

@@ -55,6 +55,7 @@ if TYPE_CHECKING:
     from diagnostics.evidence.reference import Reference
     from diagnostics.healthy.prediction import Prediction
     from diagnostics.layout import SensorLayout
+    from diagnostics.model.record import Record, Recorder
     from diagnostics.preprocessing.load import LoadDirection
     from diagnostics.preprocessing.scale import Array, Scale
     from diagnostics.sensor.crosstalk import Crosstalk
@@ -84,6 +85,7 @@ class StreamState:
             skipped.
         load: how readings become loads; None: they are.
         order: int ``[D]``, which reading of a frame each cell is; None: they are in order.
+        recorder: builds the record that the model judges; None: there is no model.
 
     Attributes:
         transport: lost and repeated frames.
@@ -109,6 +111,7 @@ class StreamState:
         needed: Mask | None = None,
         load: LoadDirection | None = None,
         order: Cells | None = None,
+        recorder: Recorder | None = None,
     ) -> None:
         model = reference.model
         every = (
@@ -146,6 +149,7 @@ class StreamState:
         self.crosstalk: Crosstalk | None = None
         self.held = np.zeros(layout.n_cells, bool)
         self._of_pad = PadLevel.begin(layout.n_cells)
+        self._recorder = recorder
         self._absent = not self.present.all()  # whether some position has no cell
         self._buffer = np.empty((SEGMENT, layout.n_cells))
         self._numbers = np.empty(SEGMENT, np.intp)
@@ -362,6 +366,16 @@ class StreamState:
             if suffixes:
                 yield np.stack(suffixes), tile.inputs, tile.place, self.model_of(i, events)
 
+    def record(self) -> Record:
+        """Return the record of the log so far, which the model judges.
+
+        Raises:
+            ValueError: there is no model, or no frame was received.
+        """
+        if self._recorder is None:
+            raise ValueError("the diagnosis has no model")
+        return self._recorder.record(self.transport.seen)
+
     def evidence_of_life(self) -> EvidenceOfLog | None:
         """Return what the log says of how cells depend on each other; the reference must have a
         model of it."""
@@ -563,6 +577,8 @@ class StreamState:
         numbers = self._numbers[: self._filled]
         begins = self._begins[: self._filled]
         self._filled = 0
+        if self._recorder is not None:
+            self._recorder = self._recorder.extend(frames, numbers, begins=begins)
         self._highest = np.fmax(self._highest, np.fmax.reduce(frames))
         self._offsets = self._offsets.extend(
             frames, self.reference.scale, self.present, self.reference.offset

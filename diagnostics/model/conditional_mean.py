@@ -126,16 +126,21 @@ class ConditionalMean:
 
 
 @dataclass(frozen=True)
-class CrossFitted:
+class CrossFitted(ConditionalMean):
     """Conditional means of which none has seen the recordings that it predicts.
 
     Attributes:
-        means: without each of the folds.
+        means: without each of the folds; the first one stands for all.
         fold: int ``[n]``, of each piece.
     """
 
     means: Sequence[ConditionalMean]
     fold: Cells
+
+    @classmethod
+    def of(cls, means: Sequence[ConditionalMean], fold: Cells) -> CrossFitted:
+        """Return the means as one."""
+        return cls(means[0].parts, means, fold)
 
     def predict(self, load: Array, known: Mask) -> tuple[Array, Array]:
         """Return what :meth:`ConditionalMean.predict` does; ``load``: of the first pieces."""

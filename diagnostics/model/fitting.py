@@ -174,9 +174,9 @@ class _HeldOut:
     def judge(self, model: Model, fold: Cells) -> None:
         """Let a model judge pieces of these folds (int ``[n]``) by what has not seen them."""
         half = fold % len(self.networks)
-        model.predictor.mean = CrossFitted(self.means, fold)
-        model.predictor.network = CrossFittedNetwork(self.networks, half)
-        model.flatness = CrossFittedFlatness(self.tables, half)
+        model.predictor.mean = CrossFitted.of(self.means, fold)
+        model.predictor.network = CrossFittedNetwork.of(self.networks, half)
+        model.flatness = CrossFittedFlatness.of(self.tables, half)
 
 
 def _held_out(reference: _Reference, symbols: Symbols, examples: Sequence[Examples]) -> _HeldOut:

@@ -25,8 +25,9 @@ from scipy.special import expit, logit, logsumexp
 from diagnostics.model.observed import Log, Observed
 from diagnostics.model.over_time import USUAL, Units
 from diagnostics.model.predictor import Predictor
-from diagnostics.model.record import Array, Cells, Mask, Record, record_of
-from diagnostics.model.symbols import NOTHING, CrossFittedFlatness, Flatness, Symbols
+from diagnostics.model.record import Array, Cells, Mask, Record, Recorder, record_of
+from diagnostics.model.rest import DITHER
+from diagnostics.model.symbols import NOTHING, Flatness, Symbols
 from diagnostics.model.ways import WAYS, Way
 
 _SUSPECT = 3.0  # evidence of a fault with which a cell predicts no other
@@ -41,6 +42,9 @@ _ITERATIONS = 10
 _EXPLAINS = 0.5  # of the evidence of any way: a value that is held
 _DISTURBED = 1 / 3  # of the cells that move
 _FEWEST = 8  # cells that show a disturbance
+# of a log: what is kept of all cells, but no fewer pieces
+_MOST_READINGS = 500_000
+_FEWEST_PIECES = 512
 
 Floats = NDArray[np.float64]
 
@@ -85,7 +89,7 @@ class Model:
     """
 
     symbols: Symbols
-    flatness: Flatness | CrossFittedFlatness
+    flatness: Flatness
     predictor: Predictor
     length: int
     present: Mask
@@ -108,6 +112,11 @@ class Model:
         odd = np.full(len(present), USUAL, np.float32)
         highest = np.zeros((len(WAYS), len(present)), np.float32)
         return cls(symbols, flatness, predictor, length, present, living, odd, highest, 1)
+
+    def recorder(self) -> Recorder:
+        """Return what builds the record of a log that goes on and on."""
+        most = max(_FEWEST_PIECES, _MOST_READINGS / len(self.present))
+        return Recorder(self.length, DITHER * self.symbols.rest.full, most)
 
     def _certain(
         self, evidence: Array, units: Units, chosen: Sequence[int] | slice = slice(None)

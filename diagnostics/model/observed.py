@@ -13,7 +13,6 @@ from diagnostics.model.rest import DITHER
 from diagnostics.model.symbols import (
     MOVES,
     NOTHING,
-    CrossFittedFlatness,
     Flatness,
     Symbols,
     activity_of,
@@ -94,9 +93,7 @@ class Observed:
         alone: log P(observed level) ``[n, D]`` by the past of the cell, nobody else.
     """
 
-    def __init__(
-        self, log: Log, known: Mask, predictor: Predictor, flatness: Flatness | CrossFittedFlatness
-    ) -> None:
+    def __init__(self, log: Log, known: Mask, predictor: Predictor, flatness: Flatness) -> None:
         self.log = log
         self.known = known
         self.predictor = predictor

@@ -14,9 +14,10 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_array
 
 from diagnostics.layout import SensorLayout
-from diagnostics.model.conditional_mean import ConditionalMean, CrossFitted, loaded
+from diagnostics.model.conditional_mean import ConditionalMean, loaded
 from diagnostics.model.record import Array, Cells, Mask
 from diagnostics.model.symbols import NOTHING
 
@@ -89,16 +90,21 @@ class Network:
 
 
 @dataclass(frozen=True)
-class CrossFittedNetwork:
+class CrossFittedNetwork(Network):
     """Networks of which none has learned from the recordings that it predicts.
 
     Attributes:
-        networks: without each of the folds.
+        networks: without each of the folds; the first one stands for all.
         fold: int ``[n]``, of each piece.
     """
 
     networks: Sequence[Network]
     fold: Cells
+
+    @classmethod
+    def of(cls, networks: Sequence[Network], fold: Cells) -> CrossFittedNetwork:
+        """Return the networks as one."""
+        return cls(**vars(networks[0]), networks=networks, fold=fold)
 
     def __call__(self, inputs: Array) -> Array:
         """Return P(level) ``[n, D, K]`` of inputs ``[n, D, k]``, of the first pieces."""
@@ -117,7 +123,7 @@ class Predictor:
     Attributes:
         living: bool ``[D]``, cells that have a load at all.
         pad: int ``[D]``, pad of each cell.
-        rings: ``[D, D]`` each, the cells beside each one, by distance.
+        around: int ``[D, k]`` each, the living cells beside each one, by distance; -1: none.
         beside: int ``[D, k]``, cells beside each one; -1: none.
         usual: ``[D, k]``, how often and how much each cell is loaded.
         mean: the conditional mean; those of the folds while the model is fitted.
@@ -126,11 +132,11 @@ class Predictor:
 
     living: Mask
     pad: NDArray[np.intp]
-    rings: Sequence[Array]
+    around: tuple[Cells, ...]
     beside: Cells
     usual: Array
-    mean: ConditionalMean | CrossFitted
-    network: Network | CrossFittedNetwork | None = None
+    mean: ConditionalMean
+    network: Network | None = None
 
     @classmethod
     def of(
@@ -142,8 +148,8 @@ class Predictor:
         often = np.log((share + 0.002) / (1.002 - share))
         much = load.sum(axis=0) / np.maximum(on.sum(axis=0), 1)
         usual = np.stack([often, much, load.std(axis=0)], axis=1).astype(np.float32)
-        rings = _rings(layout, living)
-        return cls(living, layout.pad_of, rings, layout.beside, usual, mean)
+        around = _around(layout, living)
+        return cls(living, layout.pad_of, around, layout.beside, usual, mean)
 
     def inputs(self, load: Array, own: Array, first: Mask, known: Mask) -> Array:
         """Return the inputs of the network, ``[n, D, k]``.
@@ -162,10 +168,10 @@ class Predictor:
         mean = np.clip(mean, -0.2, 1)
         surely = np.clip(surely, -0.3, 1.3)
         columns = [mean, np.sqrt(np.maximum(mean, 0)), surely]
-        for ring in self.rings:
-            count = np.maximum(telling @ ring, 1)
-            columns += [told @ ring / count, on @ ring / count]
-        columns.append(np.broadcast_to(np.minimum(telling @ self.rings[0], 4), (n, d)))
+        for ring in self._rings:
+            count = np.maximum(ring @ telling, 1)
+            columns += [(ring @ told.T).T / count, (ring @ on.T).T / count]
+        columns.append(np.broadcast_to(np.minimum(self._rings[0] @ telling, 4), (n, d)))
         count = np.maximum(self.on_pad(telling), 1)
         columns += [self.on_pad(told) / count, self.on_pad(on) / count]
         columns.append(np.broadcast_to(told.mean(axis=1, keepdims=True), (n, d)))
@@ -174,6 +180,11 @@ class Predictor:
         columns += [last, loaded(last), _before(mean, first), _before(surely, first)]
         columns.append(np.broadcast_to(first[:, None], (n, d)))
         return np.stack(columns, axis=-1).astype(np.float32)
+
+    @cached_property
+    def _rings(self) -> list[csr_array]:
+        """Which cells lie around each one, sparse ``[D, D]`` for each ring."""
+        return [_matrix(cells) for cells in self.around]
 
     def on_pad(self, values: Array) -> Array:
         """Return the sum of values ``[..., D]`` over the pad of each cell, ``[..., D]``."""
@@ -212,10 +223,27 @@ def _before(values: Array, first: Mask) -> Array:
     return found
 
 
-def _rings(layout: SensorLayout, living: Mask) -> list[Array]:
-    """Return which living cells lie around each one, ``[D, D]`` for each ring."""
+def _around(layout: SensorLayout, living: Mask) -> tuple[Cells, ...]:
+    """Return the living cells around each living one, int ``[D, k]`` for each ring; -1: none."""
     shape = (layout.pads, layout.rows, layout.cols)
     pad, row, col = np.unravel_index(np.arange(layout.n_cells), shape)
-    away = (row[:, None] - row) ** 2 + (col[:, None] - col) ** 2
-    beside = living & living[:, None] & (pad[:, None] == pad)
-    return [(beside & np.isin(away, distances)).astype(np.float32) for distances in _RINGS.values()]
+    reach = int(np.sqrt(max(max(distances) for distances in _RINGS.values())))
+    found: dict[int, list[Cells]] = {ring: [] for ring in _RINGS}
+    for down in range(-reach, reach + 1):
+        for right in range(-reach, reach + 1):
+            inside = (row + down >= 0) & (row + down < layout.rows)
+            inside &= (col + right >= 0) & (col + right < layout.cols)
+            other = np.ravel_multi_index((pad, row + down, col + right), shape, mode="clip")
+            lives = inside & living & living[other]
+            for ring, distances in _RINGS.items():
+                if down**2 + right**2 in distances:
+                    found[ring].append(np.where(lives, other, -1))
+    return tuple([np.stack(cells, axis=1) for cells in found.values()])
+
+
+def _matrix(cells: Cells) -> csr_array:
+    """Return a sparse matrix ``[D, D]`` with ones at the cells ``[D, k]`` of each row."""
+    there = cells >= 0
+    row = np.nonzero(there)[0]
+    ones = np.ones(len(row), np.float32)
+    return csr_array((ones, (row, cells[there])), shape=(len(cells), len(cells)))

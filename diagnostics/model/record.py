@@ -7,7 +7,7 @@ unit, in which a healthy cell may be odd, is a few successive pieces of one reco
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -20,6 +20,8 @@ Cells = NDArray[np.intp]
 LONGEST = 8  # frames of a piece
 UNIT = 8  # pieces of a unit
 _PIECES = 6  # of a short recording
+_FEWEST = 3
+_KEPT = 0.75  # of the pieces that there may be, once there are more
 
 
 @dataclass(frozen=True)
@@ -82,37 +84,204 @@ def frames_of_piece(recordings: Sequence[NDArray[np.floating]]) -> int:
     return int(np.clip(typical // _PIECES, 1, LONGEST))
 
 
+@dataclass(frozen=True)
+class _Pieces:
+    """Successive pieces.
+
+    Attributes:
+        low, high: lowest and highest reading ``[n, D]``; NaN: none was received.
+        total, count: sum and number of the readings that were received, ``[n, D]``.
+        frames: int ``[n]``, frames of each piece.
+        recording, begins: as of :class:`Record`.
+    """
+
+    low: Array
+    high: Array
+    total: NDArray[np.float64]
+    count: NDArray[np.int32]
+    frames: Cells
+    recording: Cells
+    begins: Cells
+
+    def __len__(self) -> int:
+        return len(self.begins)
+
+    def chosen(self, which: slice | Mask) -> _Pieces:
+        """Return some of the pieces."""
+        return _Pieces(*[values[which] for values in vars(self).values()])
+
+    @staticmethod
+    def joined(parts: Sequence[_Pieces]) -> _Pieces:
+        """Return the pieces of all parts, in order."""
+        every = [vars(part) for part in parts]
+        return _Pieces(*[np.concatenate([part[name] for part in every]) for name in every[0]])
+
+    def merged(self, into_last: Mask) -> _Pieces:
+        """Return the pieces where some of them (bool ``[n]``) belong to the one before."""
+        if not into_last.any():
+            return self
+        first = np.flatnonzero(~into_last)
+        return _Pieces(
+            np.fmin.reduceat(self.low, first, axis=0),
+            np.fmax.reduceat(self.high, first, axis=0),
+            np.add.reduceat(self.total, first, axis=0),
+            np.add.reduceat(self.count, first, axis=0),
+            np.add.reduceat(self.frames, first),
+            self.recording[first],
+            self.begins[first],
+        )
+
+    def unchanged(self, tolerance: float) -> Mask:
+        """Return the pieces that no reading leaves that lie before and behind, bool ``[n]``."""
+        same = np.zeros(len(self), bool)
+        if len(self) < _FEWEST:
+            return same
+        high = np.fmax.reduce([self.high[:-2], self.high[1:-1], self.high[2:]])
+        low = np.fmin.reduce([self.low[:-2], self.low[1:-1], self.low[2:]])
+        same[1:-1] = ~(high - low > tolerance).any(axis=1)
+        same[1:-1] &= self.recording[:-2] == self.recording[2:]
+        return same
+
+    def record(self, n_frames: int) -> Record:
+        """Return the record of a log of ``n_frames``."""
+        received = self.count > 0
+        mean = (self.total / np.maximum(self.count, 1)).astype(np.float32)
+        low = self.low
+        high = self.high
+        if not received.all():
+            last = _last_received(received, self.recording)
+            low = np.take_along_axis(low, last, 0)
+            high = np.take_along_axis(high, last, 0)
+            mean = np.take_along_axis(mean, last, 0)
+            mean[:, ~received.any(axis=0)] = np.nan
+        return Record(low, high, mean, received, self.recording, self.begins, n_frames)
+
+
+@dataclass(frozen=True)
+class Recorder:
+    """Builds the record of a log, frame by frame, in constant memory.
+
+    A piece begins with each recording, and with every ``length``-th frame of it; an end of less
+    than half a piece belongs to the piece before. With more than ``most`` pieces, those in which
+    nothing changes are dropped, then the oldest.
+
+    Attributes:
+        length: frames of a piece.
+        tolerance: readings change by more.
+        most: pieces that are kept, about.
+        complete: pieces that no frame changes any more.
+        last: the last two, which may.
+        recordings: number of those that began.
+    """
+
+    length: int
+    tolerance: float = 0.0
+    most: float = np.inf
+    complete: tuple[_Pieces, ...] = ()
+    last: _Pieces | None = None
+    recordings: int = 0
+
+    def extend(
+        self, frames: NDArray[np.floating], numbers: Cells, *, begins: Mask | None = None
+    ) -> Recorder:
+        """Return the recorder after more frames.
+
+        Args:
+            frames: readings ``[t, D]``; NaN: missing.
+            numbers: int ``[t]``, of the frames.
+            begins: bool ``[t]``, frames with which a recording begins; None: the first one.
+        """
+        if not len(frames):
+            return self
+        if begins is None:
+            begins = np.arange(len(frames)) == 0
+        open_frames = 0
+        if self.last is None:
+            begins = begins | (np.arange(len(frames)) == 0)
+        else:
+            open_frames = int(self.last.frames[-1])
+        # frames of the recording so far, up to a multiple of the length
+        since = np.arange(len(frames)) + open_frames
+        since -= np.maximum.accumulate(np.where(begins, since, 0))
+        starts = (since % self.length == 0) | begins
+        first = np.flatnonzero(starts)
+        continues = not starts[0]
+        if continues:
+            first = np.insert(first, 0, 0)
+        new = _pieces(frames, numbers, first)
+        opens = begins[first]
+        new = replace(new, recording=self.recordings - 1 + np.cumsum(opens))
+        run = new
+        before = 0
+        if self.last is not None:
+            run = _Pieces.joined([self.last, new])
+            before = len(self.last)
+        joins = np.zeros(len(run), bool)
+        joins[before] = continues
+        run = run.merged(joins)
+        ended = np.diff(run.recording, append=run.recording[-1]) > 0
+        run = run.merged(self._too_short(run) & ended)
+        kept = (*self.complete, run.chosen(slice(0, -2)))
+        return replace(
+            self,
+            complete=self._fewer(kept),
+            last=run.chosen(slice(-2, None)),
+            recordings=self.recordings + int(opens.sum()),
+        )
+
+    def record(self, n_frames: int) -> Record:
+        """Return the record of a log of ``n_frames`` that ends here.
+
+        Raises:
+            ValueError: no frame was received.
+        """
+        if self.last is None:
+            raise ValueError("a record needs a frame")
+        run = self.last
+        at_end = np.arange(len(run)) == len(run) - 1
+        run = run.merged(self._too_short(run) & at_end)
+        return _Pieces.joined([*self.complete, run]).record(n_frames)
+
+    def _too_short(self, run: _Pieces) -> Mask:
+        """Return the pieces of less than half a length behind another of the same recording, bool
+        ``[n]``."""
+        follows = np.diff(run.recording, prepend=-1) == 0
+        found: Mask = follows & (2 * run.frames < self.length)
+        return found
+
+    def _fewer(self, complete: tuple[_Pieces, ...]) -> tuple[_Pieces, ...]:
+        if sum(map(len, complete)) <= self.most:
+            return complete
+        every = _Pieces.joined(complete)
+        every = every.chosen(~every.unchanged(self.tolerance))
+        return (every.chosen(slice(-int(self.most * _KEPT), None)),)
+
+
 def record_of(recordings: Sequence[NDArray[np.floating]], length: int) -> Record:
-    """Return the record of recordings ``[T, D]`` each, with about ``length`` frames a piece; NaN:
+    """Return the record of recordings ``[T, D]`` each, with ``length`` frames a piece; NaN:
     missing."""
-    starts = []
-    number = []
+    recorder = Recorder(length)
     frame = 0
-    for i, one in enumerate(recordings):
-        n = max(1, round(len(one) / length))
-        starts.append(frame + np.arange(n) * len(one) // n)
-        number.append(np.full(n, i))
+    for one in recordings:
+        recorder = recorder.extend(one, frame + np.arange(len(one)))
         frame += len(one)
-    begins = np.concatenate(starts)
-    x = np.concatenate(recordings).astype(np.float32)
+    return recorder.record(frame)
+
+
+def _pieces(frames: NDArray[np.floating], numbers: Cells, first: Cells) -> _Pieces:
+    """Return the pieces of frames ``[t, D]``; ``first``: int ``[n]``, index of the first one of
+    each."""
+    x = frames.astype(np.float32)
     missing = np.isnan(x)
-    low = np.fmin.reduceat(x, begins, axis=0)
-    high = np.fmax.reduceat(x, begins, axis=0)
-    count = np.diff(np.append(begins, frame))[:, None].astype(np.float32)
-    received = np.ones(low.shape, bool)
-    if missing.any():
-        count = np.add.reduceat((~missing).astype(np.float32), begins, axis=0)
-        received = count > 0
-        x = np.nan_to_num(x)
-    mean = (np.add.reduceat(x, begins, axis=0) / np.maximum(count, 1)).astype(np.float32)
-    recording = np.concatenate(number)
-    if not received.all():
-        last = _last_received(received, recording)
-        low = np.take_along_axis(low, last, 0)
-        high = np.take_along_axis(high, last, 0)
-        mean = np.take_along_axis(mean, last, 0)
-        mean[:, ~received.any(axis=0)] = np.nan
-    return Record(low, high, mean, received, recording, begins, frame)
+    return _Pieces(
+        np.fmin.reduceat(x, first, axis=0),
+        np.fmax.reduceat(x, first, axis=0),
+        np.add.reduceat(np.where(missing, 0, x), first, axis=0, dtype=np.float64),
+        np.add.reduceat(~missing, first, axis=0, dtype=np.int32),
+        np.diff(np.append(first, len(x))),
+        np.zeros_like(first),
+        numbers[first],
+    )
 
 
 def _last_received(received: Mask, recording: Cells) -> Cells:

@@ -139,16 +139,21 @@ class Flatness:
 
 
 @dataclass(frozen=True)
-class CrossFittedFlatness:
+class CrossFittedFlatness(Flatness):
     """Tables of which none has counted the recordings that it judges.
 
     Attributes:
-        tables: without each of the folds.
+        tables: without each of the folds; the first one stands for all.
         fold: int ``[n]``, of each piece.
     """
 
     tables: Sequence[Flatness]
     fold: Cells
+
+    @classmethod
+    def of(cls, tables: Sequence[Flatness], fold: Cells) -> CrossFittedFlatness:
+        """Return the tables as one."""
+        return cls(**vars(tables[0]), tables=tables, fold=fold)
 
     def of_others(self, group: Cells, activity: Cells, flat: NDArray[np.int8]) -> Array:
         """Return log P(flat | group, activity of the others ``[n]``), ``[n, D]``."""

@@ -118,7 +118,7 @@ def test_an_array_that_is_missing_misshapen_or_not_finite_is_refused_by_name(arr
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
-        ({"schema": "adaptfault.diagnoser/2"}, "schema"),
+        ({"schema": "adaptfault.diagnoser/1"}, "schema"),
         ({"layout": {"rows": 3}}, "pads"),
         ({"layout": None}, "damaged"),
         ({"false_discovery_rate": None}, "damaged"),

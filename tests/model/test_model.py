@@ -179,15 +179,24 @@ def test_an_unknown_engine_is_refused_with_those_there_are():
         SelfDiagnosis(LAYOUT, engine="other")
 
 
-def test_what_cannot_be_stored_or_streamed_is_refused(fitted, tmp_path, healthy):
-    with pytest.raises(ValueError, match="not stored"):
-        fitted.save(tmp_path / "diagnosis")
-    with pytest.raises(ValueError, match="whole logs"):
-        Monitor(fitted)
-    stream = fitted.stream()
-    stream.extend(healthy[0])
-    with pytest.raises(ValueError, match="whole logs"):
-        fitted.evaluate(stream)
+def test_a_stored_diagnosis_judges_bit_for_bit_as_before(fitted, tmp_path, healthy):
+    healthy[0][:, USED] = 1500.0
+    path = tmp_path / "fitted.npz"
+    fitted.save(path)
+    again = SelfDiagnosis.load(path)
+    assert again.engine == "model"
+    assert again.diagnose(healthy).to_dict() == fitted.diagnose(healthy).to_dict()
+
+
+def test_a_monitor_says_at_the_end_what_the_whole_log_says(fitted, healthy):
+    for frames in healthy:
+        frames[:, USED[0]] = 1500.0
+    monitor = Monitor(fitted)
+    for frame in np.concatenate(healthy):
+        monitor.update(frame)
+    assert {fault.cells for fault in monitor.faults} == {(USED[0],)}
+    whole = fitted.diagnose(np.concatenate(healthy))
+    assert monitor.diagnosis().to_dict() == whole.to_dict()
 
 
 def test_a_clone_has_the_same_engine(fitted):

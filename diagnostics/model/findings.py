@@ -12,7 +12,7 @@ from diagnostics.faults import FaultKind
 from diagnostics.model.judge import HELD, Judgement
 from diagnostics.model.record import Mask
 from diagnostics.model.ways import WAYS
-from diagnostics.preprocessing.levels import DOUBTED
+from diagnostics.preprocessing.levels import DOUBTED, RARE
 
 _SHOWN = 1.0  # evidence that excludes a way to fail, or suggests one
 _NO_READING = (FaultKind.LATE, FaultKind.COPY)  # but frames, or a cell
@@ -23,7 +23,8 @@ Floats = NDArray[np.float64]
 def findings(
     judgement: Judgement, stream: StreamState, full_scale: float, rate: float
 ) -> CellFindings:
-    """Return the findings about each cell of a log.
+    """Return the findings about each cell of a log: the model judges pieces; blinks and noise of
+    single frames are told by the stream.
 
     Args:
         judgement: of the log.
@@ -38,15 +39,22 @@ def findings(
     delivers = present & ~silent
     probability = np.where(delivers, judgement.probability, np.where(silent, 1.0, 0.0))
     faulty = np.asarray(faulty_at(np.where(silent, 0.0, probability), rate) & delivers)
+    frames = stream.intermittency
+    blinks = frames.intermittent & delivers
+    noisy = frames.excess & delivers
     if judgement.disturbed:
         faulty = faulty & (log.run >= HELD)
         probability = np.where(delivers & ~faulty, np.minimum(probability, 0.5), probability)
-    faulty = faulty | silent
+        blinks = np.zeros_like(blinks)
+        noisy = np.zeros_like(noisy)
+    by_frames = blinks | noisy
+    probability = np.where(by_frames, 1 - RARE, probability)
+    faulty = faulty | silent | by_frames
     moves = np.array([way.kind is not None for way in WAYS])[judgement.way]
     kind = _refuted(judgement)
-    refuted = np.where(faulty & moves & ~silent, kind, -1)
+    refuted = np.where(faulty & moves & ~silent & ~by_frames, kind, -1)
     value = log.value.astype(np.float64)
-    holds = delivers & ~moves
+    holds = delivers & ~moves & ~by_frames
     rests = holds & (np.abs(value - rest.level) <= rest.near + log.symbols.tolerance)
     reading = stream.reading(value)
     beyond = holds & ~rests
@@ -60,15 +68,23 @@ def findings(
         rests=rests,
         full=beyond & (reading >= top),
         zero=None if stream.load is None else beyond & (reading <= log.symbols.tolerance),
-        intermittent=zero,
-        noisy=zero,
+        intermittent=blinks,
+        noisy=noisy,
         drifting=zero,
         gain=nothing,
-        value=_value(judgement, refuted, stream, reading),
-        since=np.where(silent, stream.runs.missed_since, _since(judgement)),
+        value=np.where(
+            blinks,
+            stream.reading(_blinks_to(stream, full_scale)),
+            _value(judgement, refuted, stream, reading),
+        ),
+        since=np.select(
+            [silent, blinks, noisy],
+            [stream.runs.missed_since, frames.blinks_since, frames.noisy_since],
+            _since(judgement),
+        ),
         probability=probability,
         weight=judgement.log_odds.astype(np.float64),
-        events=np.full(len(present), len(judgement.units.begins), np.intp),
+        events=np.where(blinks, frames.blinks, len(judgement.units.begins)),
         known=stream.reference.dead > 0,
         refuted=refuted,
         unsure=np.full(len(present), -1),
@@ -110,6 +126,15 @@ def _value(
             if way.kind not in _NO_READING:
                 told = stream.reading(told)
             found[of_way] = told[of_way]
+    return found
+
+
+def _blinks_to(stream: StreamState, full_scale: float) -> Floats:
+    """Return the load to which each cell blinks, ``[D]``: full scale where most blinks go there."""
+    frames = stream.intermittency
+    found: Floats = np.where(
+        2 * frames.high > frames.blinks, full_scale, np.maximum(stream.lowest, 0.0)
+    )
     return found
 
 

@@ -6,7 +6,15 @@ import numpy as np
 import pytest
 from sklearn.base import clone
 
-from diagnostics import FaultKind, Monitor, SelfDiagnosis, SensorLayout, Verdict
+from diagnostics import (
+    Fault,
+    FaultKind,
+    Monitor,
+    SelfDiagnosis,
+    SensorLayout,
+    Verdict,
+    inject,
+)
 from diagnostics.model import Model, fit_model
 from diagnostics.model.ways import WAYS
 
@@ -201,3 +209,11 @@ def test_a_monitor_says_at_the_end_what_the_whole_log_says(fitted, healthy):
 
 def test_a_clone_has_the_same_engine(fitted):
     assert clone(fitted).engine == "model"
+
+
+@pytest.mark.parametrize("kind", [FaultKind.INTERMITTENT, FaultKind.NOISY])
+def test_what_fails_for_single_frames_is_told_by_its_name(fitted, kind):
+    log = presses(2, 12)
+    whole = inject(np.concatenate(log), [Fault(kind, (27,))], LAYOUT, seed=1)
+    (fault,) = fitted.diagnose(np.split(whole, 12)).faults
+    assert (fault.cells, fault.kind) == ((27,), kind)

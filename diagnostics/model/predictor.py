@@ -26,9 +26,12 @@ _BLUR = 0.02  # of a level that is one further up, or down
 _HIDDEN = (32, 32)
 _BATCH = 2048
 _STEPS = 1000
+_FEWEST_STEPS = 50
+_STEPS_OF_ROUND = 10  # after which the weights count for the average
 _AVERAGED = 0.3  # of the last steps (Polyak and Juditsky 1992)
 _EPOCHS = 12  # at most
 _RATE = 0.02
+_ROWS = 16_384  # that are computed at once
 _RINGS = {1: (1,), 2: (2,), 4: (4, 5, 8)}  # squared distances of the cells of a ring
 
 
@@ -58,33 +61,37 @@ class Network:
         deviation = inputs.std(axis=0) + np.float32(1e-6)
         z = (inputs - mean) / deviation
         rng = np.random.default_rng(0)
-        steps = int(np.clip(_EPOCHS * len(z) / _BATCH, 50, most * _STEPS))
+        steps = int(np.clip(_EPOCHS * len(z) / _BATCH, _FEWEST_STEPS, most * _STEPS))
         fit = MLPClassifier(_HIDDEN, learning_rate_init=_RATE, alpha=1e-6, random_state=0)
         fit.batch_size = min(_BATCH, len(z))
-        averaged: list[Array] = []
-        taken = 0
-        for step in range(steps):
-            pick = rng.integers(0, len(z), fit.batch_size)
+        rounds = -(-steps // _STEPS_OF_ROUND)
+        averaged: list[list[Array]] = []
+        for number in range(rounds):
+            pick = rng.integers(0, len(z), _STEPS_OF_ROUND * fit.batch_size)
             fit.partial_fit(z[pick], level[pick], classes=np.arange(n_levels))
-            if step >= steps * (1 - _AVERAGED):
-                taken += 1
-                layers = [*fit.coefs_, *fit.intercepts_]
-                if not averaged:
-                    averaged = [np.zeros_like(layer) for layer in layers]
-                for total, layer in zip(averaged, layers, strict=True):
-                    total += layer
-        layers = [(total / taken).astype(np.float32) for total in averaged]
+            if number >= rounds * (1 - _AVERAGED):
+                averaged.append([layer.copy() for layer in [*fit.coefs_, *fit.intercepts_]])
+        layers = [np.mean(of_rounds, axis=0) for of_rounds in zip(*averaged, strict=True)]
         half = len(layers) // 2
         return cls(mean, deviation, tuple(layers[:half]), tuple(layers[half:]))
 
     def __call__(self, inputs: Array) -> Array:
         """Return P(level) ``[..., K]`` of inputs ``[..., k]``."""
+        rows = inputs.reshape(-1, inputs.shape[-1])
+        found = np.empty((len(rows), len(self.biases[-1])), np.float32)
+        for begin in range(0, len(rows), _ROWS):
+            found[begin : begin + _ROWS] = self._of_rows(rows[begin : begin + _ROWS])
+        return found.reshape(*inputs.shape[:-1], -1)
+
+    def _of_rows(self, inputs: Array) -> Array:
         hidden = (inputs - self.mean) / self.deviation
         for weight, bias in zip(self.weights[:-1], self.biases[:-1], strict=True):
-            hidden = np.maximum(hidden @ weight + bias, 0)
+            hidden = hidden @ weight
+            hidden += bias
+            np.maximum(hidden, 0, out=hidden)
         logits = hidden @ self.weights[-1] + self.biases[-1]
         logits -= logits.max(axis=-1, keepdims=True)
-        found: Array = np.exp(logits)
+        found: Array = np.exp(logits, out=logits)
         found /= found.sum(axis=-1, keepdims=True)
         return found
 

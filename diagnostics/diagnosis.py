@@ -146,7 +146,7 @@ class SelfDiagnosis:
         *,
         false_discovery_rate: float = 0.006,
         proof_of_life: bool = True,
-        engine: str = "events",
+        engine: str = "model",
     ) -> None:
         if engine not in _ENGINES:
             raise ValueError(f"engine: expected {' or '.join(map(repr, _ENGINES))}, got {engine!r}")
@@ -278,7 +278,8 @@ class SelfDiagnosis:
         self.reference_ = replace(self.reference_, sizes=usual, floors=floors)
         if self.engine == "model":
             self._model = fit_model(list(healthy), layout, dead > 0, progress=progress)
-            calibrator = Calibrator.cold()
+            if self._model is not None:
+                calibrator = Calibrator.cold()
         elif self.proof_of_life:
             self.reference_ = self.reference_.with_life(healthy, layout)
         if calibrator is None:

@@ -51,6 +51,7 @@ _LIVES = 1e-5  # of full scale: a range of readings
 _ODD_UNITS = 50.0  # units of all cells that weigh on the share of one
 _RARELY = 1e-3
 _OFTEN = 0.2
+_SHORTEST = 24  # frames of a recording that is taken apart
 _LOGS = 32
 _LENGTHS = (3, 6, 6, 6, 6, 6, 6, 40)  # recordings of a log
 _DEAD = (0.0, 0.04, 0.08, 0.16)  # shares of the cells that are dead in it
@@ -104,20 +105,20 @@ def fit_model(
     dead: Mask,
     *,
     progress: Callable[[float], None] = lambda share: None,
-) -> Model:
+) -> Model | None:
     """Fit to fault-free recordings ``[T, D]`` of loads or readings, NaN: missing.
 
     Args:
-        recordings: eight at least, in which cells move.
+        recordings: in which cells move; few long ones are taken apart.
         layout: of the array; ``full_scale`` is the highest reading that there is.
         dead: bool ``[D]``, cells that are dead in them.
         progress: receives the share of the work that is done.
 
-    Raises:
-        ValueError: too few recordings, or no cell moves in them.
+    Returns:
+        None: too few frames, or no cell moves in them.
     """
     rng = np.random.default_rng(0)
-    recordings = [np.asarray(one, np.float32) for one in recordings]
+    recordings = _enough([np.asarray(one, np.float32) for one in recordings])
     present = layout.present.ravel()
     full = float(layout.full_scale)
     length = frames_of_piece(recordings)
@@ -125,10 +126,7 @@ def fit_model(
     ranges = np.fmax.reduce(record.high) - np.fmin.reduce(record.low)
     living = present & ~dead & (ranges > _LIVES * full)
     if len(recordings) < FEWEST or not living.any():
-        raise ValueError(
-            f"engine='model' learns from {FEWEST} recordings or more in which cells move, got"
-            f" {len(recordings)} with {living.sum()} cells that do: use engine='events'"
-        )
+        return None
     rest = fit_rest(record, full, converter_step(recordings, layout), layout.pad_of, living)
     above = rest.above(record, living)
     symbols = Symbols.fit(above, rest, living)
@@ -160,6 +158,18 @@ def fit_model(
     model.flatness = flatness
     progress(1.0)
     return model
+
+
+def _enough(recordings: list[Array]) -> list[Array]:
+    """Return the recordings, the longest in halves until there are enough to leave some out."""
+    while len(recordings) < FEWEST:
+        longest = max(range(len(recordings)), key=lambda i: len(recordings[i]))
+        one = recordings[longest]
+        if len(one) < _SHORTEST:
+            break
+        half = len(one) // 2
+        recordings[longest : longest + 1] = [one[:half], one[half:]]
+    return recordings
 
 
 @dataclass(frozen=True)

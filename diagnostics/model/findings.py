@@ -54,7 +54,7 @@ def findings(
     kind = _refuted(judgement)
     refuted = np.where(faulty & moves & ~silent & ~by_frames, kind, -1)
     value = log.value.astype(np.float64)
-    holds = delivers & ~moves & ~by_frames
+    holds = delivers & np.where(faulty, ~moves & ~by_frames, log.run >= HELD)
     rests = holds & (np.abs(value - rest.level) <= rest.near + log.symbols.tolerance)
     reading = stream.reading(value)
     beyond = holds & ~rests

@@ -106,9 +106,14 @@ class Observed:
         self.alone = log.alone(predictor)
 
     def _unwitnessed(self) -> Mask:
-        """Return where a cell rests and nobody on its pad tells of a contact, bool ``[n, D]``: that
-        nothing touches a pad is no surprise, however often something usually does."""
+        """Return where nobody tells of a contact, bool ``[n, D]``.
+
+        A cell rests and nobody on its pad is loaded: that nothing touches a pad is no surprise,
+        however often something usually does. Or nobody is known: all loads may be one contact.
+        """
         log = self.log
+        if not self.known.any():
+            return log.level < log.symbols.top
         witnesses = (log.load > NOTHING) & self.known
         touched = self.predictor.on_pad(witnesses.astype(np.float32)) > 0
         found: Mask = (log.level == 0) & ~touched
@@ -116,11 +121,13 @@ class Observed:
 
     def constancy(self, *, dithers: bool) -> Array:
         """Return the log ratio ``[n, D]`` of how flat a piece is, given the one before, where a
-        cell holds its value."""
+        cell holds its value: nothing where no known cell moves."""
         log = self.log
+        moves = ((log.flat == MOVES) & self.known).any(axis=1)
         healthy = self.flatness.of_chain(self.group, log.before, log.flat)
         ratio = _LOOKS[int(dithers)][log.flat] - healthy
-        found: Array = np.where(log.holds & (log.flat != MOVES), ratio, 0).astype(np.float32)
+        tells = log.holds & (log.flat != MOVES) & moves[:, None]
+        found: Array = np.where(tells, ratio, 0).astype(np.float32)
         return found
 
     def delayed(self, lag: int) -> Array:

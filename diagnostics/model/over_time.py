@@ -14,6 +14,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.special import logsumexp
 
 from diagnostics.model.observed import Observed
 from diagnostics.model.record import Array, Cells, Mask
@@ -25,6 +26,7 @@ _OFTEN = 0.3
 _MOST = 40.0  # log ratio whose exponential is taken
 _FAILS = 0.05  # of the units, P(a fault that comes and goes comes)
 _RECOVERS = 0.15
+_GOES = 3.0  # evidence that a fault has gone
 
 
 @dataclass(frozen=True)
@@ -66,8 +68,8 @@ def _bounded(ratio: Array, odd: Array) -> Array:
 
 def throughout(ratio: Array, units: Units) -> Array:
     """Return the evidence ``[D]`` of a fault in all pieces."""
-    found: Array = units.of_units(ratio).sum(axis=0)
-    return found
+    of_units = units.of_units(ratio)
+    return _unless_gone(of_units.sum(axis=0), of_units)
 
 
 def _since_each(ratio: Array, units: Units) -> Array:
@@ -96,7 +98,15 @@ def for_good(ratio: Array, units: Units) -> Array:
         return at_once
     most = since.max(axis=0)
     later = np.log(np.exp(since[1:] - most).mean(axis=0) + np.finfo(float).tiny) + most
-    found: Array = np.logaddexp(at_once, later) - np.log(2)
+    return _unless_gone(np.logaddexp(at_once, later) - np.log(2), units.of_units(ratio))
+
+
+def _unless_gone(evidence: Array, of_units: Array) -> Array:
+    """Return the evidence ``[D]`` of a fault that lasts: no more than what the log says since the
+    likeliest end of it, where that denies it."""
+    sums = np.cumsum(of_units, axis=0)
+    since = sums[-1] - sums.max(axis=0)
+    found: Array = np.where(since < -_GOES, np.minimum(evidence, since), evidence)
     return found
 
 
@@ -124,4 +134,6 @@ def now_and_then(ratio: Array, units: Units) -> Array:
         z = 1 - gone + gone * unit
         total = total + np.log(z).astype(np.float32)
         gone = gone * unit / z
-    return total
+    once: Array = logsumexp(np.log(likelihood).cumsum(axis=0), axis=0) - np.log(len(likelihood))
+    found: Array = total - np.logaddexp(0, once)
+    return found

@@ -162,7 +162,8 @@ class Recorder:
     """Builds the record of a log, frame by frame, in constant memory.
 
     A piece begins with each recording, and with every ``length``-th frame of it; an end of less
-    than half a piece belongs to the piece before. With more than ``most`` pieces, those in which
+    than half a piece belongs to the piece before. A frame that repeats the one before tells
+    nothing, and is left out: loggers are faster than sensors. With more than ``most`` pieces, those in which
     nothing changes are dropped, then the oldest.
 
     Attributes:
@@ -172,6 +173,7 @@ class Recorder:
         complete: pieces that no frame changes any more.
         last: the last two, which may.
         recordings: number of those that began.
+        given: ``[D]``, the last frame; None: there was none.
     """
 
     length: int
@@ -180,6 +182,7 @@ class Recorder:
     complete: tuple[_Pieces, ...] = ()
     last: _Pieces | None = None
     recordings: int = 0
+    given: NDArray[np.floating] | None = None
 
     def extend(
         self, frames: NDArray[np.floating], numbers: Cells, *, begins: Mask | None = None
@@ -195,6 +198,13 @@ class Recorder:
             return self
         if begins is None:
             begins = np.arange(len(frames)) == 0
+        fresh = self._fresh(frames) | begins
+        given = frames[-1]
+        frames = frames[fresh]
+        numbers = numbers[fresh]
+        begins = begins[fresh]
+        if not len(frames):
+            return self
         open_frames = 0
         if self.last is None:
             begins = begins | (np.arange(len(frames)) == 0)
@@ -227,7 +237,19 @@ class Recorder:
             complete=self._fewer(kept),
             last=run.chosen(slice(-2, None)),
             recordings=self.recordings + int(opens.sum()),
+            given=given,
         )
+
+    def _fresh(self, frames: NDArray[np.floating]) -> Mask:
+        """Return the frames ``[t, D]`` that do not repeat the one before, bool ``[t]``."""
+        before = np.full_like(frames, np.nan)
+        before[1:] = frames[:-1]
+        if self.given is not None:
+            before[0] = self.given
+        same = (frames == before) | (np.isnan(frames) & np.isnan(before))
+        found: Mask = ~same.all(axis=1)
+        found[0] |= self.given is None
+        return found
 
     def record(self, n_frames: int) -> Record:
         """Return the record of a log of ``n_frames`` that ends here.

@@ -105,6 +105,29 @@ class Fitted:
     model: Model | None = None
 
 
+@dataclass(frozen=True)
+class _Judged:
+    """What is known of each cell of a log, before root causes.
+
+    Attributes:
+        found: findings about each cell.
+        aliases: causes of lines that read the same.
+        still: objects that lie still.
+        shown: bool ``[D]``, cells that depend on the others as healthy ones do.
+        contradicting: share of the cells that contradict them, where nobody is blamed for it.
+        evidence: by name, ``[D]``.
+        life: the proof of life, to test lines with; None: they are not tested.
+    """
+
+    found: CellFindings
+    aliases: Sequence[Fault]
+    still: Sequence[StaticLoad]
+    shown: NDArray[np.bool_]
+    contradicting: float
+    evidence: Mapping[str, NDArray[np.float64]]
+    life: Life | None = None
+
+
 def _no_progress(share: float) -> None:
     """Nobody looks at the progress."""
 
@@ -146,7 +169,7 @@ class SelfDiagnosis:
         *,
         false_discovery_rate: float = 0.006,
         proof_of_life: bool = True,
-        engine: str = "model",
+        engine: str = "events",
     ) -> None:
         if engine not in _ENGINES:
             raise ValueError(f"engine: expected {' or '.join(map(repr, _ENGINES))}, got {engine!r}")
@@ -573,8 +596,33 @@ class SelfDiagnosis:
         stream = stream.complete()
         if not stream.received.any():
             raise ValueError("the recordings hold no frame with a reading: nothing to diagnose")
-        if self._model is not None:
-            return self._diagnosed_by_model(self._model, stream, n_recordings)
+        if self._model is None:
+            judged = self._by_events(stream, life)
+        else:
+            judged = self._by_model(self._model, stream)
+        return self._concluded(stream, judged, n_recordings)
+
+    def _by_model(self, model: Model, stream: StreamState) -> _Judged:
+        """Return what the model says of the log behind a ``stream``."""
+        aliases, _ = find_aliasing(stream)
+        judgement = model.judge_record(stream.record())
+        found = findings(judgement, stream, self.layout.full_scale, self.false_discovery_rate)
+        evidence = {
+            "spatial": found.weight,
+            "temporal": np.zeros(len(found.weight)),
+            "events": found.events.astype(np.float64),
+        }
+        return _Judged(
+            found=found,
+            aliases=aliases,
+            still=[],
+            shown=shown(judgement),
+            contradicting=judgement.disturbed,
+            evidence=evidence,
+        )
+
+    def _by_events(self, stream: StreamState, life: Life | None) -> _Judged:
+        """Return what contact events and the proof of life say; arguments as in evaluate."""
         aliases, copies = find_aliasing(stream)
         explained = copies
         still = list[StaticLoad]()
@@ -608,35 +656,7 @@ class SelfDiagnosis:
             groups, stream.each_excluded(spatial, explained, groups), strict=True
         ):
             weight[group] = np.maximum(weight[group], together(surprisal)[group])
-        found = replace(found, weight=weight).of(self._place)
-        causes, possible = root_causes(found, aliases, self.layout)
-        unused = self._unused(stream, found.alive, causes, contradicted=life.contradicting > 0)
-        if unused.any():
-            found = found.without(unused)
-            causes, possible = root_causes(found, aliases, self.layout)
-        probability = found.probability.copy()
-        still = [load.of(self._order, self.layout) for load in still]
-        for load in still:
-            probability[list(load.cells)] = 1 - load.probability
-        probability, inferred = _with_causes(probability, causes)
-        # Noise alone is no test; nor is movement, where the reference tells how cells depend on
-        # each other; nor is a line that a shorted crossing pulls.
-        pulled = np.zeros_like(inferred)
-        if tests_lines:
-            pulled = self._pulled(stream, life, causes, inferred)
-            causes = pulling(causes, pulled[self._place], self.layout)
-        shown = (life.shown | (stream.reference.dead > 0)) & ~pulled
-        if self._of_log or self.reference_ is None:
-            shown &= reads_enough(stream.ranges, self._planes)
-        if stream.crosstalk is not None:
-            shown &= stream.crosstalk.own
-        scale = stream.scale
         intermittency = stream.intermittency
-        working = np.empty_like(inferred)
-        moved = bool((stream.runs.moved & stream.present).any())
-        working[self._place] = ~inferred & (found.alive if moved else self.layout.present.ravel())
-        # Where cells moved, loads of a frozen frame come or go: other cells have another offset.
-        rest = np.maximum(scale.baseline, stream.lowest) if moved else scale.baseline
         evidence = {
             "spatial": spatial.evidence + spatial.offset + spatial.gain,
             "temporal": np.where(
@@ -644,20 +664,61 @@ class SelfDiagnosis:
             ),
             "events": spatial.events.astype(np.float64),
         }
+        return _Judged(
+            found=replace(found, weight=weight),
+            aliases=aliases,
+            still=still,
+            shown=stream.touched & (life.shown | (stream.reference.dead > 0)),
+            contradicting=life.contradicting,
+            evidence=evidence,
+            life=life if tests_lines else None,
+        )
+
+    def _concluded(self, stream: StreamState, judged: _Judged, n_recordings: int) -> Diagnosis:
+        """Return the diagnosis of a log by what is known of each cell."""
+        found = judged.found.of(self._place)
+        causes, possible = root_causes(found, judged.aliases, self.layout)
+        contradicted = judged.contradicting > 0
+        unused = self._unused(stream, found.alive, causes, contradicted=contradicted)
+        if unused.any():
+            found = found.without(unused)
+            causes, possible = root_causes(found, judged.aliases, self.layout)
+        probability = found.probability.copy()
+        still = [load.of(self._order, self.layout) for load in judged.still]
+        for load in still:
+            probability[list(load.cells)] = 1 - load.probability
+        probability, inferred = _with_causes(probability, causes)
+        # Noise alone is no test; nor is movement, where the reference tells how cells depend on
+        # each other; nor is a line that a shorted crossing pulls.
+        shown = judged.shown
+        if judged.life is not None:
+            pulled = self._pulled(stream, judged.life, causes, inferred)
+            causes = pulling(causes, pulled[self._place], self.layout)
+            shown = shown & ~pulled
+        if self._of_log or self.reference_ is None:
+            shown = shown & reads_enough(stream.ranges, self._planes)
+        if stream.crosstalk is not None:
+            shown = shown & stream.crosstalk.own
+        scale = stream.scale
+        working = np.empty_like(inferred)
+        moved = bool((stream.runs.moved & stream.present).any())
+        working[self._place] = ~inferred & (found.alive if moved else self.layout.present.ravel())
+        # Where cells moved, loads of a frozen frame come or go: other cells have another offset.
+        rest = np.maximum(scale.baseline, stream.lowest) if moved else scale.baseline
         return Diagnosis(
             layout=self.layout,
             faults=causes,
             probability=probability,
-            tested=(found.alive & (stream.touched & shown)[self._place]) | inferred,
+            tested=(found.alive & shown[self._place]) | inferred,
             transport=stream.transport.faults(
                 rest + scale.near, working, self.layout.rate, moved, falls=self._falls(stream)
             ),
-            evidence={name: values[self._place] for name, values in evidence.items()},
+            evidence={name: values[self._place] for name, values in judged.evidence.items()},
             n_frames=stream.transport.seen,
             n_recordings=n_recordings,
             possible=(*possible, *cut_off(unused, self.layout)),
             static_loads=tuple(still),
-            contradicting=life.contradicting,
+            contradicting=judged.contradicting,
         )
 
     def proof(self, stream: StreamState) -> Life:
@@ -801,39 +862,6 @@ class SelfDiagnosis:
             for frames in log[i : i + 1].blocks():
                 stream.extend(frames)
         return self.evaluate(stream, n_recordings=len(log))
-
-    def _diagnosed_by_model(
-        self, model: Model, stream: StreamState, n_recordings: int
-    ) -> Diagnosis:
-        """Return what the model says of the log behind a ``stream``."""
-        judgement = model.judge_record(stream.record())
-        full_scale = self.layout.full_scale
-        found = findings(judgement, stream, full_scale, self.false_discovery_rate)
-        aliases, _ = find_aliasing(stream)
-        of_cells = found.of(self._place)
-        causes, possible = root_causes(of_cells, aliases, self.layout)
-        probability, blamed = _with_causes(of_cells.probability, causes)
-        working = of_cells.alive & ~blamed
-        rest = stream.scale.baseline + stream.scale.near
-        evidence = {
-            "spatial": of_cells.weight,
-            "temporal": np.zeros(len(blamed)),
-            "events": of_cells.events.astype(np.float64),
-        }
-        return Diagnosis(
-            layout=self.layout,
-            faults=causes,
-            probability=probability,
-            tested=(of_cells.alive & shown(judgement)[self._place]) | blamed,
-            transport=stream.transport.faults(
-                rest, working, self.layout.rate, moved=True, falls=self._falls(stream)
-            ),
-            evidence=evidence,
-            n_frames=stream.transport.seen,
-            n_recordings=n_recordings,
-            possible=possible,
-            contradicting=judgement.disturbed,
-        )
 
     def _diagnosed_when(
         self, log: RecordingBlocks, classes: ArrayLike | None, crosstalk: Crosstalk | None

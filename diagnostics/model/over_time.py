@@ -14,7 +14,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.special import logsumexp
 
 from diagnostics.model.observed import Observed
 from diagnostics.model.record import Array, Cells, Mask
@@ -120,7 +119,8 @@ def since(ratio: Array, units: Units) -> Cells:
 
 def now_and_then(ratio: Array, units: Units) -> Array:
     """Return the evidence ``[D]`` of a fault that comes and goes: a two-state Markov chain over the
-    units of a recording (forward algorithm, Rabiner 1989), which begins anew with each."""
+    units of a recording (forward algorithm, Rabiner 1989), which begins anew with each. One that
+    was there once and has gone is none."""
     # a healthy cell that is odd now and then is what this fault looks like
     doubted = replace(units, odd=np.maximum(units.odd, USUAL))
     likelihood = np.exp(doubted.of_units(ratio))
@@ -134,6 +134,6 @@ def now_and_then(ratio: Array, units: Units) -> Array:
         z = 1 - gone + gone * unit
         total = total + np.log(z).astype(np.float32)
         gone = gone * unit / z
-    once: Array = logsumexp(np.log(likelihood).cumsum(axis=0), axis=0) - np.log(len(likelihood))
-    found: Array = total - np.logaddexp(0, once)
-    return found
+    of_units = np.log(likelihood)
+    once = of_units.cumsum(axis=0).max(axis=0) - np.log(len(of_units))
+    return np.where(once > total, _unless_gone(total, of_units), total)

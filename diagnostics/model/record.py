@@ -163,8 +163,8 @@ class Recorder:
 
     A piece begins with each recording, and with every ``length``-th frame of it; an end of less
     than half a piece belongs to the piece before. A frame that repeats the one before tells
-    nothing, and is left out: loggers are faster than sensors. With more than ``most`` pieces, those in which
-    nothing changes are dropped, then the oldest.
+    nothing, and is left out: loggers are faster than sensors. With more than ``most`` pieces,
+    those in which nothing changes are dropped, then the oldest.
 
     Attributes:
         length: frames of a piece.
@@ -246,8 +246,9 @@ class Recorder:
         before[1:] = frames[:-1]
         if self.given is not None:
             before[0] = self.given
-        same = (frames == before) | (np.isnan(frames) & np.isnan(before))
-        found: Mask = ~same.all(axis=1)
+        missing = np.isnan(frames)
+        same = (frames == before) | (missing & np.isnan(before))
+        found: Mask = ~same.all(axis=1) | missing.all(axis=1)
         found[0] |= self.given is None
         return found
 

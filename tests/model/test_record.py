@@ -50,11 +50,20 @@ def test_where_nothing_was_received_a_piece_reads_as_the_one_before():
 
 
 def test_a_recording_that_begins_without_a_reading_takes_none_of_the_one_before():
-    before = np.full((4, 1), 7.0)
-    after = np.array([[np.nan]] * 4 + [[3.0]] * 4)
+    before = 5.0 + np.arange(4)[:, None]
+    after = np.array([[np.nan]] * 4 + [[30.0], [31.0], [32.0], [33.0]])
     record = record_of([before, after], 4)
     assert not record.received[1, 0]
-    assert record.mean[1, 0] != 7.0
+    assert record.mean[1, 0] < 5.0
+
+
+def test_frames_that_repeat_the_one_before_tell_nothing():
+    fresh = np.arange(24.0)[:, None]
+    repeated = np.repeat(fresh, 5, axis=0)
+    one = record_of([fresh, fresh], 4)
+    other = record_of([repeated, repeated], 4)
+    np.testing.assert_array_equal(one.mean, other.mean)
+    np.testing.assert_array_equal(5 * one.begins, other.begins)
 
 
 @pytest.mark.parametrize(("frames", "length"), [(1, 1), (12, 2), (60, 8), (1000, 8)])

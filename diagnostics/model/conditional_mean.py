@@ -72,9 +72,7 @@ class Tile:
         z = (_both(load[:, self.inputs]) - self.mean) / self.deviation
         found = np.zeros_like(z)
         if two.any():
-            precision = cho_solve(
-                cho_factor(self.covariance[np.ix_(two, two)]), np.eye(int(two.sum()))
-            )
+            precision = self._precision(two)
             y = z[:, two] @ precision
             found[:, two] = z[:, two] - _left_out(y, precision)
             found[:, ~two] = y @ self.covariance[np.ix_(two, ~two)]
@@ -82,6 +80,45 @@ class Tile:
         found = found * scale + self.mean
         n = len(one)
         return found[:, :n][:, self.place], found[:, n:][:, self.place]
+
+    def sums(self, load: Array, known: Mask, on: Mask, of: Mask) -> Floats:
+        """Return the expected sum of the loads of some cells of each line, by those off it,
+        ``[n, W]``.
+
+        With P the inverse of the covariance C of the known cells, y = P z, and a those of them on
+        the line, ``y - P_a (P_aa)^-1 y_a`` is what the others say.
+
+        Args:
+            load: root loads ``[n, D]``.
+            known: bool ``[D]``, cells that tell.
+            on: bool ``[W, D]``, cells on each line.
+            of: bool ``[W, D]``, those of them that are summed up.
+        """
+        outputs = self.inputs[self.place]
+        chosen = of[:, outputs].astype(float)
+        total = np.zeros((len(load), len(on))) + chosen @ self.mean[self.place]
+        two = np.tile(known[self.inputs], 2)
+        lines = np.flatnonzero(chosen.any(axis=1))
+        if not two.any():
+            return total
+        z = (_both(load[:, self.inputs]) - self.mean) / self.deviation
+        precision = self._precision(two)
+        scale = np.where(np.isinf(self.deviation), 0, self.deviation)[self.place]
+        weight = self.covariance[np.ix_(two, self.place)] @ (chosen[lines] * scale).T
+        explained = precision @ weight
+        for k, line in enumerate(lines.tolist()):
+            own = np.flatnonzero(np.tile(on[line, self.inputs], 2)[two])
+            block = cho_factor(precision[np.ix_(own, own)])
+            weight[own, k] -= cho_solve(block, explained[own, k])
+        total[:, lines] += z[:, two] @ (precision @ weight)
+        return total
+
+    def _precision(self, two: Mask) -> Floats:
+        """Return the inverse of the covariance of some inputs, bool ``[2 k]``."""
+        found: Floats = cho_solve(
+            cho_factor(self.covariance[np.ix_(two, two)]), np.eye(int(two.sum()))
+        )
+        return found
 
 
 def _left_out(y: Floats, precision: Floats) -> Floats:
@@ -124,6 +161,14 @@ class ConditionalMean:
             mean[:, outputs], surely[:, outputs] = part.predict(load, known)
         return mean, surely
 
+    def sums(self, load: Array, known: Mask, on: Mask, of: Mask) -> Floats:
+        """Return the expected sums ``[n, W]`` of the loads of the cells in ``of`` on each line, by
+        the ``known`` ones off it: ``on`` and ``of`` bool ``[W, D]``."""
+        found = np.zeros((len(load), len(on)))
+        for part in self.parts:
+            found += part.sums(load, known, on, of)
+        return found
+
 
 @dataclass(frozen=True)
 class CrossFitted(ConditionalMean):
@@ -151,3 +196,12 @@ class CrossFitted(ConditionalMean):
             of_fold = fold == k
             mean[of_fold], surely[of_fold] = self.means[k].predict(load[of_fold], known)
         return mean, surely
+
+    def sums(self, load: Array, known: Mask, on: Mask, of: Mask) -> Floats:
+        """Return what :meth:`ConditionalMean.sums` does; ``load``: of the first pieces."""
+        found = np.zeros((len(load), len(on)))
+        fold = self.fold[: len(load)]
+        for k in np.unique(fold).tolist():
+            of_fold = fold == k
+            found[of_fold] = self.means[k].sums(load[of_fold], known, on, of)
+        return found

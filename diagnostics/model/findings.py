@@ -6,12 +6,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from diagnostics.decision.calibration import faulty_at
-from diagnostics.decision.root_causes import REFUTED_KINDS, CellFindings
+from diagnostics.decision.root_causes import OF_WIRES, REFUTED_KINDS, CellFindings
 from diagnostics.evidence.stream_state import StreamState
 from diagnostics.faults import FaultKind
 from diagnostics.model.judge import HELD, Judgement
 from diagnostics.model.record import Mask
 from diagnostics.model.ways import WAYS
+from diagnostics.model.ways.comes_and_goes import COMES_AND_GOES
 from diagnostics.preprocessing.levels import DOUBTED, RARE
 
 _SHOWN = 1.0  # evidence that excludes a way to fail, or suggests one
@@ -47,18 +48,29 @@ def findings(
         probability = np.where(delivers & ~faulty, np.minimum(probability, 0.5), probability)
         blinks = np.zeros_like(blinks)
         noisy = np.zeros_like(noisy)
+    # a line that fails as a whole explains what its cells do
+    failing = judgement.failing
+    on_line = delivers & failing.cells & (judgement.disturbed == 0)
+    blinks &= ~on_line
+    noisy &= ~on_line
     by_frames = blinks | noisy
     probability = np.where(by_frames, 1 - RARE, probability)
-    faulty = faulty | silent | by_frames
-    moves = np.array([way.kind is not None for way in WAYS])[judgement.way]
-    kind = _refuted(judgement)
-    refuted = np.where(faulty & moves & ~silent & ~by_frames, kind, -1)
+    probability = np.where(on_line, failing.probability, probability)
+    faulty = faulty | silent | by_frames | on_line
+    way = np.where(on_line, WAYS.index(COMES_AND_GOES), judgement.way)
+    kind = _kinds()[way]
+    refuted = np.where(faulty & ~silent & ~by_frames, kind, -1)
     value = log.value.astype(np.float64)
-    holds = delivers & np.where(faulty, ~moves & ~by_frames, log.run >= HELD)
+    # what never left its rest agrees with a broken line, whatever is likeliest of it
+    holds = delivers & (faulty | (log.run >= HELD)) & (refuted < 0) & ~by_frames
     rests = holds & (np.abs(value - rest.level) <= rest.near + log.symbols.tolerance)
     reading = stream.reading(value)
     beyond = holds & ~rests
     top = full_scale - log.symbols.tolerance
+    # not certain one by one: the cells of a line that fails now and then fail together
+    comes_and_goes = (kind >= 0) & (kind < len(OF_WIRES))
+    likely = (judgement.evidence.max(axis=0) > 0) & ~shown(judgement)
+    unsure = delivers & log.far & ~faulty & comes_and_goes & likely & (judgement.disturbed == 0)
     zero = np.zeros_like(present)
     nothing = np.full(len(present), np.nan)
     return CellFindings(
@@ -75,22 +87,24 @@ def findings(
         value=np.where(
             blinks,
             stream.reading(_blinks_to(stream, full_scale)),
-            _value(judgement, refuted, stream, reading),
+            _value(judgement, np.where(refuted >= 0, way, -1), stream, reading),
         ),
         since=np.select(
             [silent, blinks, noisy],
             [stream.runs.missed_since, frames.blinks_since, frames.noisy_since],
-            _since(judgement),
+            _since(judgement, way, on_line),
         ),
         probability=probability,
-        weight=judgement.log_odds.astype(np.float64),
-        events=np.where(blinks, frames.blinks, len(judgement.units.begins)),
+        weight=_weight(judgement, holds),
+        events=np.select(
+            [blinks, on_line], [frames.blinks, failing.units], len(judgement.units.begins)
+        ),
         known=stream.reference.dead > 0,
         refuted=refuted,
-        unsure=np.full(len(present), -1),
-        wire=np.full(len(present), -1),
-        of_wire=np.zeros(len(present)),
-        share=np.zeros(len(present)),
+        unsure=np.where(unsure, kind, -1),
+        wire=np.where(on_line, failing.line, -1),
+        of_wire=failing.probability,
+        share=failing.share,
         as_one=zero,
         typical=reading,
     )
@@ -105,25 +119,32 @@ def shown(judgement: Judgement) -> Mask:
     return found
 
 
-def _refuted(judgement: Judgement) -> NDArray[np.intp]:
-    """Return the number of the kind of each cell's likeliest way; -1: it holds a value."""
+def _weight(judgement: Judgement, holds: Mask) -> Floats:
+    """Return the log ratio of each cell, faulty : healthy, ``[D]``; of one that ``holds`` a value
+    (bool) by that alone."""
+    of_holding = judgement.evidence[[way.kind is None for way in WAYS]].max(axis=0)
+    return np.where(holds, of_holding, judgement.log_odds).astype(np.float64)
+
+
+def _kinds() -> NDArray[np.intp]:
+    """Return the number of the kind of each way; -1: it holds a value."""
     numbers = {kind: i for i, kind in enumerate(REFUTED_KINDS)}
-    of_way = [-1 if way.kind is None else numbers[way.kind] for way in WAYS]
-    return np.array(of_way)[judgement.way]
+    return np.array([-1 if way.kind is None else numbers[way.kind] for way in WAYS])
 
 
 def _value(
-    judgement: Judgement, refuted: NDArray[np.intp], stream: StreamState, reading: Floats
+    judgement: Judgement, way: NDArray[np.intp], stream: StreamState, reading: Floats
 ) -> Floats:
-    """Return what is told of each cell's likeliest fault, ``[D]``."""
+    """Return what is told of the fault of each cell, ``[D]``; ``way``: int ``[D]``, number of its
+    way to move; -1: none."""
     found = reading.copy()
-    for i, way in enumerate(WAYS):
-        of_way = (judgement.way == i) & (refuted >= 0)
-        if way.value is not None and of_way.any():
-            told = way.value(judgement.observed).astype(np.float64)
-            if way.kind is FaultKind.COPY and stream.order is not None:
+    for i, one in enumerate(WAYS):
+        of_way = way == i
+        if one.value is not None and of_way.any():
+            told = one.value(judgement.observed).astype(np.float64)
+            if one.kind is FaultKind.COPY and stream.order is not None:
                 told = np.where(np.isnan(told), told, stream.order[np.nan_to_num(told).astype(int)])
-            if way.kind not in _NO_READING:
+            if one.kind not in _NO_READING:
                 told = stream.reading(told)
             found[of_way] = told[of_way]
     return found
@@ -138,13 +159,14 @@ def _blinks_to(stream: StreamState, full_scale: float) -> Floats:
     return found
 
 
-def _since(judgement: Judgement) -> NDArray[np.intp]:
-    """Return the number of the first frame of each cell's likeliest fault, int ``[D]``."""
+def _since(judgement: Judgement, way: NDArray[np.intp], on_line: Mask) -> NDArray[np.intp]:
+    """Return the number of the first frame of the fault of each cell, int ``[D]``; ``on_line``:
+    bool ``[D]``, cells of a line that fails."""
     begins = judgement.observed.log.record.begins
-    found = np.zeros(len(judgement.way), np.intp)
-    for i, way in enumerate(WAYS):
-        of_way = judgement.way == i
-        if way.since is not None and of_way.any():
-            piece = way.since(judgement.observed, judgement.units)
+    found = np.where(on_line, begins[judgement.failing.since], 0)
+    for i, one in enumerate(WAYS):
+        of_way = (way == i) & ~on_line
+        if one.since is not None and of_way.any():
+            piece = one.since(judgement.observed, judgement.units)
             found[of_way] = begins[piece[of_way]]
     return found

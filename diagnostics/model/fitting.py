@@ -9,7 +9,7 @@ of each way to fail: what it says of a healthy cell stays below certainty.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from diagnostics.evidence.reference import converter_step
 from diagnostics.layout import SensorLayout
 from diagnostics.model.conditional_mean import ConditionalMean, CrossFitted
-from diagnostics.model.judge import Model
+from diagnostics.model.judge import Judgement, Model
+from diagnostics.model.lines import NO_HALF, Lines, fit_lines, odd_of
 from diagnostics.model.predictor import CrossFittedNetwork, Network, Predictor
 from diagnostics.model.record import Array, Cells, Mask, Record, frames_of_piece, record_of
 from diagnostics.model.rest import fit_rest
@@ -145,14 +146,19 @@ def fit_model(
     examples = _examples(predictor, reference, rng)
     network = Network.fit(*_together(examples), symbols.n)
     progress(0.4)
-    held_out = _held_out(reference, symbols, examples)
+    cross_fitted = CrossFitted.of(means, reference.of_piece)
+    half = reference.of_piece % _HALVES
+    lines, resting = fit_lines(layout, living, cross_fitted, load, record, half)
+    held_out = _held_out(reference, symbols, examples, resting)
     progress(0.5)
     flatness = reference.flatness(symbols, np.ones(len(record), bool))
-    model = Model.of(symbols, flatness, predictor, length, present, living)
+    model = Model.of(symbols, flatness, predictor, length, present, living, lines)
     held_out.judge(model, reference.of_piece)
     model.odd = _odd(model, reference)
+    model.lines = replace(model.lines, odd=_odd_lines(model, reference))
     progress(0.6)
-    model.highest, model.reached = _highest(model, reference, held_out, rng)
+    model.highest, model.lines, model.reached = _highest(model, reference, held_out, rng)
+    model.lines = replace(model.lines, resting=lines.resting, half=NO_HALF)
     predictor.mean = whole
     predictor.network = network
     model.flatness = flatness
@@ -175,11 +181,12 @@ def _enough(recordings: list[Array]) -> list[Array]:
 @dataclass(frozen=True)
 class _HeldOut:
     """What is fitted without each fold: conditional means, and without each half: networks and
-    tables."""
+    tables; of how lines rest ``[halves, W, M]``."""
 
     means: Sequence[ConditionalMean]
     networks: Sequence[Network]
     tables: Sequence[Flatness]
+    resting: Array
 
     def judge(self, model: Model, fold: Cells) -> None:
         """Let a model judge pieces of these folds (int ``[n]``) by what has not seen them."""
@@ -187,9 +194,12 @@ class _HeldOut:
         model.predictor.mean = CrossFitted.of(self.means, fold)
         model.predictor.network = CrossFittedNetwork.of(self.networks, half)
         model.flatness = CrossFittedFlatness.of(self.tables, half)
+        model.lines = replace(model.lines, resting=self.resting, half=half)
 
 
-def _held_out(reference: _Reference, symbols: Symbols, examples: Sequence[Examples]) -> _HeldOut:
+def _held_out(
+    reference: _Reference, symbols: Symbols, examples: Sequence[Examples], resting: Array
+) -> _HeldOut:
     """Return what is fitted without each fold, and without each half of them."""
     half = reference.of_piece % _HALVES
     networks = []
@@ -198,7 +208,7 @@ def _held_out(reference: _Reference, symbols: Symbols, examples: Sequence[Exampl
         others = [of_fold for i, of_fold in enumerate(examples) if i % _HALVES != k]
         networks.append(Network.fit(*_together(others), symbols.n, _FEWER))
         tables.append(reference.flatness(symbols, half != k))
-    return _HeldOut(reference.means, networks, tables)
+    return _HeldOut(reference.means, networks, tables, resting)
 
 
 def _together(examples: Sequence[Examples]) -> Examples:
@@ -254,13 +264,22 @@ def _odd(model: Model, reference: _Reference) -> Array:
     return found
 
 
+def _odd_lines(model: Model, reference: _Reference) -> Array:
+    """Return in which share of its units each healthy line is odd, ``[W]``."""
+    log = model.log_of_record(reference.record)
+    living = model.living & log.received
+    _, ratio, _ = model.lines.evidence(model.observed(log, living), living, living)
+    return odd_of(ratio)
+
+
 def _highest(
     model: Model, reference: _Reference, held_out: _HeldOut, rng: np.random.Generator
-) -> tuple[Array, int]:
+) -> tuple[Array, Lines, int]:
     """Return the evidence of each way that healthy cells reach, ``[ways, D]``, in logs that are
-    held out, with dead cells beside, and the units of the longest log."""
+    held out, with dead cells beside, the lines with theirs, and the units of the longest log."""
     cells = np.flatnonzero(model.living)
     highest = np.zeros((len(WAYS), len(model.present)))
+    of_lines = np.zeros(len(model.lines.on))
     every = []
     longest = 1
     for i in range(_LOGS):
@@ -275,11 +294,29 @@ def _highest(
                 frames[:, cell] = value
         record = record_of(log, model.length)
         held_out.judge(model, reference.fold[chosen][record.recording])
-        evidence = model.judge_record(record).evidence
+        judgement = model.judge_record(record)
+        evidence = judgement.evidence
+        of_lines = np.maximum(of_lines, _of_healthy_lines(model, judgement, rng))
         healthy = np.setdiff1d(cells, dead)
         highest[:, healthy] = np.maximum(highest[:, healthy], evidence[:, healthy])
         every.append(evidence[:, healthy])
         longest = max(longest, len(record.units))
     reached = np.concatenate(every, axis=1)
     tail = np.quantile(reached, 1 - _EXCEED / len(cells), axis=1)
-    return np.maximum(highest, tail[:, None]).astype(np.float32), longest
+    lines = replace(model.lines, highest=of_lines.astype(np.float32), reached=longest)
+    return np.maximum(highest, tail[:, None]).astype(np.float32), lines, longest
+
+
+def _of_healthy_lines(model: Model, judgement: Judgement, rng: np.random.Generator) -> Array:
+    """Return the evidence of each line ``[W]`` in a log without broken ones, and with a line beside
+    it that is left out."""
+    observed = judgement.observed
+    moving = model.moving(observed.log)
+    found = np.zeros(len(model.lines.on), np.float32)
+    if len(found):
+        out = model.lines.on[rng.integers(len(found))]
+        for free in (np.ones_like(out), ~out):
+            known = observed.known & free
+            evidence, _, _ = model.lines.evidence(observed, known, moving & free)
+            found = np.maximum(found, evidence)
+    return found

@@ -9,8 +9,7 @@ as the others say join them. With w the ways to fail and their evidence E_w,
 where the prevalence p is that of the log (EM, shrunk to a usual one). Where many of the cells that
 move are refuted, the whole array does what the reference never saw: nobody is blamed for it.
 
-Not detected: an object that lies still (its cells hold a load); a wire whose cells fail together
-for a time and predict each other.
+Not detected: an object that lies still (its cells hold a load).
 """
 
 from __future__ import annotations
@@ -22,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import expit, logit, logsumexp
 
+from diagnostics.model.lines import Failing, Lines
 from diagnostics.model.observed import Log, Observed
 from diagnostics.model.over_time import USUAL, Units
 from diagnostics.model.predictor import Predictor
@@ -61,6 +61,7 @@ class Judgement:
         known: bool, trusted cells.
         observed: what these say of the log.
         units: of the log.
+        failing: lines that fail now and then.
         disturbed: share of the cells that move which are refuted, where it is so large that none of
             them is faulty; else 0.
     """
@@ -72,6 +73,7 @@ class Judgement:
     known: Mask
     observed: Observed
     units: Units
+    failing: Failing
     disturbed: float
 
 
@@ -86,6 +88,7 @@ class Model:
         odd: ``[D]``, share of the units in which each healthy cell is odd.
         highest: ``[ways, D]``, evidence of each way that a healthy cell reaches.
         reached: units of the longest log in which they did.
+        lines: of the array.
     """
 
     symbols: Symbols
@@ -97,6 +100,7 @@ class Model:
     odd: Array
     highest: Array
     reached: int
+    lines: Lines
 
     @classmethod
     def of(
@@ -107,11 +111,12 @@ class Model:
         length: int,
         present: Mask,
         living: Mask,
+        lines: Lines,
     ) -> Model:
         """Return the model before healthy logs tell how odd cells are."""
         odd = np.full(len(present), USUAL, np.float32)
         highest = np.zeros((len(WAYS), len(present)), np.float32)
-        return cls(symbols, flatness, predictor, length, present, living, odd, highest, 1)
+        return cls(symbols, flatness, predictor, length, present, living, odd, highest, 1, lines)
 
     def recorder(self) -> Recorder:
         """Return what builds the record of a log that goes on and on."""
@@ -143,7 +148,10 @@ class Model:
     def judge_record(self, record: Record) -> Judgement:
         """Judge a record, with pieces of this model's length."""
         log = self.log_of_record(record)
-        observed = self._by_trusted(log)
+        observed = self._by_trusted(log, np.zeros_like(log.far))
+        failing = self.lines.failing(observed, self.moving(log))
+        if failing.cells.any():
+            observed = self._by_trusted(log, failing.cells)
         units = Units.of(observed, self.odd)
         evidence = np.stack([way.evidence(observed, units) for way in WAYS])
         evidence = self._certain(evidence, units)
@@ -159,16 +167,23 @@ class Model:
             known=observed.known,
             observed=observed,
             units=units,
+            failing=failing,
             disturbed=self._disturbed(log, probability),
         )
 
-    def _by_trusted(self, log: Log) -> Observed:
-        """Return what those say of a log who are trusted to predict the others."""
+    def moving(self, log: Log) -> Mask:
+        """Return the cells that move and hold no load at the end, bool ``[D]``."""
+        found: Mask = log.far & self.living & ~((log.run >= HELD) & (log.load[-1] > NOTHING))
+        return found
+
+    def _by_trusted(self, log: Log, out: Mask) -> Observed:
+        """Return what those say of a log who are trusted to predict the others; those that are
+        ``out`` (bool ``[D]``) are not."""
         deciding = [i for i, way in enumerate(WAYS) if way.decides]
         ways = [WAYS[i] for i in deciding]
         holds = (log.run >= HELD) & (log.load[-1] > NOTHING)
-        stays = ~(log.received & self.living)
-        observed = self.observed(log, log.far & ~holds & self.living)
+        stays = ~(log.received & self.living) | out
+        observed = self.observed(log, self.moving(log) & ~out)
         for _ in range(_ROUNDS):
             known = observed.known
             units = Units.of(observed, self.odd)

@@ -45,14 +45,23 @@ class Units:
     opens: Mask
 
     @classmethod
-    def of(cls, observed: Observed, odd: Array) -> Units:
-        """Return the units of a log; ``odd``: ``[D]``, share in which each healthy cell is odd."""
+    def of(cls, observed: Observed, odd: Array, begins: Cells | None = None) -> Units:
+        """Return the units of a log.
+
+        Args:
+            observed: the log.
+            odd: ``[D]``, share in which each healthy cell (or ``[W]``, line) is odd.
+            begins: int ``[units]``, first piece of each; None: those of the record.
+        """
         record = observed.log.record
+        if begins is None:
+            begins = record.units
         known = observed.known
         strange = (observed.odd & known).sum(axis=1)
         share = (strange + _SURE * USUAL) / (known.sum() + _SURE)
         here = np.clip(share[:, None] / USUAL * odd, _RARELY, _OFTEN)
-        return cls(record.units, record.of_unit, here, record.first[record.units])
+        of_piece = np.searchsorted(begins, np.arange(len(record)), "right") - 1
+        return cls(begins, of_piece, here[record.of_unit[begins]], record.first[begins])
 
     def of_units(self, ratio: Array) -> Array:
         """Return the evidence of each unit ``[units, D]`` of log ratios ``[n, D]``."""

@@ -1,0 +1,319 @@
+"""Lines that fail now and then: are their cells loaded as those off them say?
+
+The cells of a line fail together and predict each other: one by one they look healthy. A line is a
+cell one level up. It rests where the mean load of its cells is none, and a table counts
+
+    P(rests | expected load, share of the cells beside it that are loaded, rested a piece ago)
+
+on the cross-fitted reference. The expected load is what the cells off the line say. As the table
+knows the piece before, the surprises of successive pieces are independent. A line that fails comes
+and goes, or is away where more than some load is expected; the worst one is left out of what the
+others say, and those are tested again.
+
+Not detected: a line with fewer than three cells that move, or without others that tell of its load;
+one whose cells keep a load or another rest while it is away. A line that breaks once and for all is
+found by the values that its cells hold.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import expit, logsumexp
+
+from diagnostics.layout import SensorLayout
+from diagnostics.model.conditional_mean import ConditionalMean
+from diagnostics.model.observed import Observed
+from diagnostics.model.over_time import Units, for_good, now_and_then
+from diagnostics.model.record import Array, Cells, Mask, Record
+from diagnostics.model.symbols import NOTHING
+from diagnostics.wiring import LineKind
+
+FEWEST = 3  # cells that tell of a line
+_KINDS: tuple[LineKind, ...] = ("row", "column", "converter", "position", "bus", "group")
+_UNIT = 2  # pieces: a line flickers more quickly than cells come and go
+_LEVELS = 16  # of the expected load
+_BESIDE = (0.01, 0.34, 0.67, 0.99)  # shares of the cells beside it, between levels
+_BEFORE = 3  # a piece ago: unknown, at rest, loaded
+_ALL_LINES = 50.0  # pieces of all lines that weigh on the table of one
+_GUESS = 0.005  # of either state, in any context
+_AWAY = 0.95  # share of the pieces in which a line that is away rests
+_LIMITS = 4  # of the load beyond which a line opens
+_ODD = 3.0  # log ratio of a unit with which a healthy line is odd
+_ODD_UNITS = 50.0  # units of all lines that weigh on the share of one
+_RARELY = 1e-3
+_OFTEN = 0.2
+_CERTAIN = 6.0  # evidence that a healthy line does not reach
+_SAFETY = 1.5
+_PRIOR = np.log(0.005)
+_PROVEN = np.log(9.0)  # log odds
+_MOST = 4  # lines that fail in a log: where more do, the whole array is disturbed
+_TELL = 0.5  # share of the cells beside a line that are known
+_SPEAKS = 0.5  # log ratio of a unit that tells of a line
+_AGAINST = 1.0
+NO_HALF: Cells = np.zeros(0, np.intp)
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Failing:
+    """The lines that fail in a log.
+
+    Attributes:
+        evidence: ``[D]``, of the worst line of each cell; 0: none.
+        line: int ``[D]``, number of the line that fails, from 0; -1: none.
+        probability: ``[D]``, that it does.
+        share: ``[D]``, of the tested units in which it was away.
+        since: int ``[D]``, first piece of those.
+        units: int ``[D]``, number of those.
+    """
+
+    evidence: Floats
+    line: Cells
+    probability: Floats
+    share: Floats
+    since: Cells
+    units: Cells
+
+    @classmethod
+    def none(cls, n_cells: int) -> Failing:
+        """Return that none does."""
+        nothing = np.zeros(n_cells)
+        number = np.zeros(n_cells, np.intp)
+        return cls(nothing, number - 1, nothing, nothing, number, number)
+
+    @property
+    def cells(self) -> Mask:
+        """bool ``[D]``, cells of lines that fail."""
+        found: Mask = self.line >= 0
+        return found
+
+    def with_one(self, on: Mask, evidence: float, ratio: Array, units: Units) -> Failing:
+        """Return the lines with one more: its cells, bool ``[D]``, and log ratio of each unit."""
+        away = ratio > _AGAINST
+        share = (ratio > _SPEAKS).sum() / max(1, (np.abs(ratio) > _SPEAKS).sum())
+        return Failing(
+            evidence=np.where(on, evidence, self.evidence),
+            line=np.where(on, self.line.max() + 1, self.line),
+            probability=np.where(on, expit(evidence + _PRIOR), self.probability),
+            share=np.where(on, share, self.share),
+            since=np.where(on, units.begins[away.argmax()], self.since),
+            units=np.where(on, away.sum(), self.units),
+        )
+
+
+@dataclass(frozen=True)
+class Lines:
+    """The lines of an array, and how healthy ones rest.
+
+    Attributes:
+        on: bool ``[W, D]``, living cells on each.
+        beside: bool ``[W, D]``, cells beside these that are not.
+        predicted: expected loads between levels.
+        resting: P(at rest | context) ``[1, W, M]``; while the model is fitted ``[halves, W, M]``,
+            without each half of the recordings.
+        half: int ``[n]``, of each piece, while the model is fitted; else empty.
+        odd: ``[W]``, share of the units in which each healthy line is odd.
+        highest: ``[W]``, evidence that it reaches.
+        reached: units of the longest log in which it did.
+    """
+
+    on: Mask
+    beside: Mask
+    predicted: Array
+    resting: Array
+    half: Cells
+    odd: Array
+    highest: Array
+    reached: int
+
+    def means(self, load: Array, of: Mask) -> Floats:
+        """Return the mean loads ``[n, W]`` of the cells in ``of``, bool ``[W, D]``."""
+        count = np.maximum(of.sum(axis=1), 1)
+        found: Floats = load @ of.T.astype(load.dtype) / count
+        return found
+
+    def expected(self, means: ConditionalMean, load: Array, known: Mask, of: Mask) -> Floats:
+        """Return the mean loads ``[n, W]`` that ``known`` cells off each line expect."""
+        count = np.maximum(of.sum(axis=1), 1)
+        found: Floats = means.sums(load, known, self.on, of) / count
+        return found
+
+    def contexts(
+        self, expected: Floats, rests: Mask, load: Array, first: Mask, known: Mask
+    ) -> Cells:
+        """Return what is known of each line and piece, 0 to M - 1, int ``[n, W]``; ``rests``: bool
+        ``[n, W]``."""
+        near = (self.beside & known).astype(np.float32)
+        on = (load > NOTHING).astype(np.float32) @ near.T
+        share = on / np.maximum(near.sum(axis=1), 1)
+        level = np.searchsorted(self.predicted, expected, "right")
+        around = level * (len(_BESIDE) + 1) + np.searchsorted(_BESIDE, share, "right")
+        before = np.zeros(rests.shape, np.intp)
+        before[1:] = np.where(first[1:, None], 0, 2 - rests[:-1])
+        found: Cells = around * _BEFORE + before
+        return found
+
+    def told(self, load: Array, known: Mask) -> Mask:
+        """Return where a known cell off a line is loaded, bool ``[n, W]``: else what is loaded is
+        the line itself."""
+        off = (~self.on & known).astype(np.float32)
+        found: Mask = (load > NOTHING).astype(np.float32) @ off.T > 0
+        return found
+
+    def ratio(self, observed: Observed, known: Mask, eligible: Mask) -> tuple[Array, Cells]:
+        """Return the log ratio away : healthy of each piece, and the level of the expected load,
+        ``[n, W]`` each.
+
+        Args:
+            observed: the log.
+            known: bool ``[D]``, cells that tell of others.
+            eligible: bool ``[D]``, cells that tell of their own line.
+        """
+        log = observed.log
+        of = self.on & eligible
+        rests = self.means(log.load, of) <= NOTHING
+        expected = self.expected(observed.predictor.mean, log.load, known, of)
+        context = self.contexts(expected, rests, log.load, log.record.first, known)
+        half = self.half if len(self.half) else np.zeros(len(context), np.intp)
+        resting = self.resting[half[:, None], np.arange(len(self.on)), context]
+        away = np.log(_AWAY) - np.log(resting)
+        # a load that the others do not expect, as of a faulty cell, is no sign of an open line
+        back = np.minimum(np.log(1 - _AWAY) - np.log(1 - resting), 0)
+        ratio = np.where(rests, away, back)
+        received = (log.record.received.astype(np.float32) @ of.T.astype(np.float32)) > 0
+        told = self.told(log.load, known) & received
+        level = context // (_BEFORE * (len(_BESIDE) + 1))
+        return np.where(told, ratio, 0).astype(np.float32), level
+
+    def evidence(
+        self, observed: Observed, known: Mask, eligible: Mask
+    ) -> tuple[Array, Array, Units]:
+        """Return the evidence of each line ``[W]``, before the limits, and of each unit
+        ``[units, W]``; arguments as for :meth:`ratio`."""
+        ratio, level = self.ratio(observed, known, eligible)
+        units = Units.of(observed, self.odd, units_of(observed.log.record))
+        comes_and_goes = now_and_then(ratio, units)
+        opens = []
+        for limit in np.linspace(1, len(self.predicted), _LIMITS).astype(np.intp):
+            beyond = np.where(level >= limit, ratio, 0)
+            opens.append(units.of_units(beyond).sum(axis=0))
+        under_load = logsumexp(opens, axis=0) - np.log(_LIMITS)
+        evidence = np.maximum(comes_and_goes, under_load)
+        enough = (self.on & eligible).sum(axis=1) >= FEWEST
+        enough &= (self.beside & known).sum(axis=1) >= _TELL * self.beside.sum(axis=1)
+        enough &= evidence > for_good(ratio, units)
+        return np.where(enough, evidence, 0), units.of_units(ratio), units
+
+    def failing(self, observed: Observed, eligible: Mask) -> Failing:
+        """Return the lines that fail in a log; ``eligible``: bool ``[D]``, cells that move and hold
+        no load."""
+        failing = Failing.none(len(eligible))
+        longer = max(1.0, len(observed.log.record.units) / self.reached)
+        most = _SAFETY * longer * self.highest
+        factor = _CERTAIN / np.maximum(_CERTAIN, most)
+        found = 0
+        while len(self.on):
+            free = ~failing.cells
+            evidence, ratio, units = self.evidence(observed, observed.known & free, eligible & free)
+            evidence = evidence * factor
+            on = self.on & eligible & free
+            of_cell = np.where(on, evidence[:, None], 0).max(axis=0)
+            failing = replace(failing, evidence=np.maximum(failing.evidence, of_cell))
+            worst = int(evidence.argmax())
+            if evidence[worst] + _PRIOR <= _PROVEN:
+                return failing
+            if found == _MOST:
+                break
+            failing = failing.with_one(on[worst], float(evidence[worst]), ratio[:, worst], units)
+            found += 1
+        return Failing.none(len(eligible))
+
+
+def units_of(record: Record) -> Cells:
+    """Return the first piece of each unit of a line, int ``[units]``."""
+    begins = record.units
+    lengths = np.diff(np.append(begins, len(record)))
+    within = np.arange(len(record)) - np.repeat(begins, lengths)
+    return np.flatnonzero(within % _UNIT == 0)
+
+
+def cells_on(layout: SensorLayout, living: Mask, kinds: Collection[LineKind] = _KINDS) -> Mask:
+    """Return the living cells (bool ``[D]``) on each line of some kinds, bool ``[W, D]``: three at
+    least and not all of them; lines with the same cells once."""
+    found: dict[bytes, Mask] = {}
+    for line in layout.lines:
+        on = np.zeros(layout.n_cells, bool)
+        on[layout.cells_on(line)] = True
+        on &= living
+        if line.kind in kinds and FEWEST <= on.sum() < living.sum():
+            found.setdefault(on.tobytes(), on)
+    return np.array(list(found.values()), bool).reshape(-1, layout.n_cells)
+
+
+def fit_lines(
+    layout: SensorLayout,
+    living: Mask,
+    mean: ConditionalMean,
+    load: Array,
+    record: Record,
+    half: Cells,
+) -> tuple[Lines, Array]:
+    """Return the lines, and P(at rest | context) without each half, ``[halves, W, M]``.
+
+    Args:
+        layout: of the array.
+        living: bool ``[D]``.
+        mean: cross-fitted.
+        load: root loads ``[n, D]`` of the reference.
+        record: of it.
+        half: int ``[n]``, of each piece.
+    """
+    on = cells_on(layout, living)
+    beside = np.zeros_like(on)
+    for k, of in enumerate(on):
+        beside[k] = layout.with_neighbours(of) & living & ~of
+    odd = np.full(len(on), _RARELY, np.float32)
+    zero = np.zeros(len(on), np.float32)
+    blank = Lines(on, beside, zero, np.zeros((1, len(on), 0), np.float32), NO_HALF, odd, zero, 1)
+    means = blank.means(load, on)
+    expected = blank.expected(mean, load, living, on)
+    share = np.linspace(0, 1, _LEVELS // 2 + 1)[1:-1]
+    loaded = expected[means > NOTHING]
+    edges = [np.quantile(some, share) for some in (expected, loaded) if some.size]
+    predicted = np.unique(np.concatenate(edges)).astype(np.float32) if edges else zero
+    blank = replace(blank, predicted=predicted)
+    rests = means <= NOTHING
+    context = blank.contexts(expected, rests, load, record.first, living)
+    told = blank.told(load, living)
+    n_contexts = (len(predicted) + 1) * (len(_BESIDE) + 1) * _BEFORE
+    counts = np.zeros((half.max() + 1, len(on), n_contexts, 2))
+    line = np.broadcast_to(np.arange(len(on)), rests.shape)
+    halves = np.broadcast_to(half[:, None], rests.shape)
+    np.add.at(counts, (halves[told], line[told], context[told], rests[told].astype(np.intp)), 1)
+    total = counts.sum(axis=0)
+    fitted = replace(blank, resting=_resting(total)[None])
+    return fitted, np.stack([_resting(total - of_half) for of_half in counts])
+
+
+def _resting(counts: Floats) -> Array:
+    """Return P(at rest | context) of each line ``[W, M]`` of counts ``[W, M, 2]``, shrunk towards
+    all lines."""
+    pooled = counts.sum(axis=0)
+    usual = (pooled[:, 1] + 0.5) / (pooled.sum(axis=1) + 1)
+    own = (counts[..., 1] + _ALL_LINES * usual) / (counts.sum(axis=2) + _ALL_LINES)
+    found: Array = np.clip(own, _GUESS, 1 - _GUESS).astype(np.float32)
+    return found
+
+
+def odd_of(ratio: Array) -> Array:
+    """Return in which share of the units ``[units, W]`` each healthy line is odd."""
+    odd = (ratio > _ODD).sum(axis=0)
+    pooled = max(odd.sum() / max(1, ratio.size), _RARELY)
+    share = (odd + _ODD_UNITS * pooled) / (len(ratio) + _ODD_UNITS)
+    found: Array = np.clip(share, _RARELY, _OFTEN).astype(np.float32)
+    return found

@@ -1,0 +1,143 @@
+"""Lines that fail now and then: named as one cause, and none in healthy logs."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from diagnostics import FaultKind, Line, SelfDiagnosis, SensorLayout, Verdict
+from diagnostics.model.conditional_mean import ConditionalMean, Tile
+from diagnostics.model.lines import cells_on
+
+LAYOUT = SensorLayout(1, 8, 8, full_scale=4095.0, rate=20.0, unit="count")
+FRAMES = 60
+REST = 40.0
+
+
+def presses(seed: int, recordings: int) -> list[np.ndarray]:
+    """Presses that come and go anywhere, in whole counts with noise."""
+    rng = np.random.default_rng(seed)
+    rows, cols = np.divmod(np.arange(64), 8)
+    found = []
+    for _ in range(recordings):
+        total = np.zeros((FRAMES, 64))
+        for _ in range(3):
+            row, col = rng.uniform(0, 7, 2)
+            shape = np.exp(-((rows - row) ** 2 + (cols - col) ** 2) / 4)
+            begin = int(rng.integers(0, FRAMES - 30))
+            total[begin : begin + 30] += 3000 * np.sin(np.linspace(0, np.pi, 30))[:, None] * shape
+        noise = rng.normal(0, 2, total.shape)
+        found.append(np.clip(REST + total + noise, 0, 4095).round())
+    return found
+
+
+@pytest.fixture(scope="module")
+def fitted() -> SelfDiagnosis:
+    return SelfDiagnosis(LAYOUT, engine="model").fit(presses(0, 80))
+
+
+@pytest.fixture
+def log() -> list[np.ndarray]:
+    return presses(1, 30)
+
+
+@pytest.fixture(scope="module")
+def load() -> np.ndarray:
+    rng = np.random.default_rng(0)
+    shared = rng.random((300, 1))
+    return np.clip(shared + 0.3 * rng.random((300, 12)) - 0.6, 0, 1).astype(np.float32)
+
+
+@settings(max_examples=20, deadline=None)
+@given(
+    known=st.lists(st.booleans(), min_size=12, max_size=12),
+    on=st.lists(st.booleans(), min_size=12, max_size=12),
+)
+def test_the_load_of_a_line_is_what_the_cells_off_it_predict_one_by_one(load, known, on):
+    cells = np.arange(12)
+    tile = Tile.fit(load, cells, cells)
+    line = np.array(on)
+    mean, _ = tile.predict(load, np.array(known) & ~line)
+    total = tile.sums(load, np.array(known), line[None], line[None])
+    np.testing.assert_allclose(total[:, 0], mean[:, line].sum(axis=1), atol=1e-7)
+
+
+def test_what_the_cells_of_a_line_read_does_not_change_what_is_expected_of_it(load):
+    layout = SensorLayout(1, 3, 4, full_scale=1.0)
+    whole = ConditionalMean.fit(load, layout, np.ones(12, bool))
+    on = cells_on(layout, np.ones(12, bool))
+    other = load.copy()
+    other[:, on[0]] = 0.9
+    known = np.ones(12, bool)
+    told = [whole.sums(some, known, on, on)[:, 0] for some in (load, other)]
+    np.testing.assert_allclose(*told, atol=1e-7)
+
+
+def test_lines_of_fewer_than_three_living_cells_tell_nothing():
+    living = np.ones(64, bool)
+    living[2:8] = False
+    on = cells_on(LAYOUT, living)
+    assert len(on) == 15
+    assert on.sum(axis=1).min() >= 3
+    assert not on[:, ~living].any()
+
+
+@pytest.mark.parametrize("line", [Line(0, "row", 3), Line(0, "column", 5)])
+@pytest.mark.parametrize("how", ["under load", "flickers"])
+def test_a_line_that_fails_now_and_then_is_one_cause_and_none_of_its_cells_is_alive(
+    fitted, log, line, how
+):
+    cells = LAYOUT.cells_on(line)
+    whole = np.concatenate(log)
+    load = (whole - REST).sum(axis=1)
+    ways = {
+        "under load": load > np.quantile(load, 0.6),
+        "flickers": np.repeat(np.random.default_rng(0).random(100) < 0.4, 18),
+    }
+    whole[np.ix_(ways[how], cells)] = REST
+    found = fitted.diagnose(np.split(whole, len(log)))
+    (fault,) = found.faults
+    assert (fault.kind, fault.line) == (FaultKind.INTERMITTENT, line)
+    assert fault.cells == tuple(cells.tolist())
+    assert fault.value == pytest.approx(REST, abs=10)
+    assert Verdict.ALIVE not in set(found.verdicts[cells])
+
+
+def test_a_line_that_is_away_in_some_recordings_is_told_with_these(fitted, log):
+    for frames in log[1::3]:
+        frames[:, LAYOUT.cells_on(Line(0, "row", 3))] = REST
+    (fault,) = fitted.diagnose(log).faults
+    assert fault.line == Line(0, "row", 3)
+    assert fault.recordings == tuple(range(1, 30, 3))
+
+
+def test_a_line_that_fails_in_the_last_recordings_is_told_with_the_first_of_them(fitted, log):
+    cells = LAYOUT.cells_on(Line(0, "row", 3))
+    for frames in log[18::2]:
+        frames[20:, cells] = REST
+    (fault,) = fitted.diagnose(log).faults
+    assert fault.line == Line(0, "row", 3)
+    assert fault.onset is not None
+    assert 18 * FRAMES <= fault.onset <= 24 * FRAMES
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_no_line_fails_in_a_healthy_log_nor_beside_dead_cells(fitted, seed):
+    log = presses(seed, 20)
+    assert not fitted.diagnose(log).faults
+    dead = np.random.default_rng(seed).choice(64, 10, replace=False)
+    for frames in log:
+        frames[:, dead] = 900.0
+    found = fitted.diagnose(log)
+    assert set(found.fault_set) == set(dead.tolist())
+    assert all(fault.line is None for fault in found.faults)
+
+
+def test_a_broken_row_beside_untested_cells_is_a_row(fitted, log):
+    cells = LAYOUT.cells_on(Line(0, "row", 3))
+    for frames in log[:8]:
+        frames[:, cells] = REST
+    (fault,) = fitted.diagnose(log[:8]).faults
+    assert (fault.kind, fault.line) == (FaultKind.OPEN, Line(0, "row", 3))

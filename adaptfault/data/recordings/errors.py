@@ -3,6 +3,8 @@ expected, the remedy."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from os import PathLike
 from typing import Literal
@@ -11,6 +13,11 @@ from adaptfault.data.printable import printable
 
 NO_FRAMES = "holds no frames; record it again or remove it"
 """What is said of a recording that is empty."""
+
+_UNFORESEEN = (
+    "cannot be read ({}): damaged, or another kind than its name says; write it again, or leave it"
+    " out"
+)
 
 
 class InputError(ValueError):
@@ -23,12 +30,25 @@ class InputError(ValueError):
         frame 12")."""
         return cls(located(path, what, where))
 
-    @classmethod
-    def unexpected(cls, path: str | PathLike[str], error: Exception) -> InputError:
-        """Return the error for a file that made a library fail in a way that its reader does not
-        foresee; the library's words are not passed on."""
-        what = f"cannot be read ({type(error).__name__}): damaged, or another kind than its name"
-        return cls.at(path, f"{what} says; write it again, or leave it out")
+
+@contextmanager
+def foreseeing(
+    path: str | PathLike[str], what: str = _UNFORESEEN, where: str = ""
+) -> Iterator[None]:
+    """Turn any error of a library into an InputError: a damaged file raises any of a dozen kinds.
+    The library's words are not passed on.
+
+    Args:
+        path: the file.
+        what: is wrong with it, and the remedy; ``{}`` stands for the kind of the error.
+        where: the place in it.
+    """
+    try:
+        yield
+    except InputError:
+        raise
+    except Exception as error:
+        raise InputError.at(path, what.format(type(error).__name__), where) from None
 
 
 @dataclass(frozen=True)

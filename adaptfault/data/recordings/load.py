@@ -26,7 +26,7 @@ from adaptfault.data.recordings.check import (
 )
 from adaptfault.data.recordings.dataset import Recordings
 from adaptfault.data.recordings.doubts import copies, doubts
-from adaptfault.data.recordings.errors import InputError, Problem, located
+from adaptfault.data.recordings.errors import InputError, Problem, foreseeing, located
 from adaptfault.data.recordings.facts.classes import class_indices, label_files
 from adaptfault.data.recordings.facts.infer import PAPER, SLACK
 from adaptfault.data.recordings.facts.layout_file import LAYOUT_NAME, layout_beside, not_stated
@@ -376,19 +376,14 @@ def open_recordings(
     notes: list[Path] = []
     for file in found:
         try:
-            recordings = list(file.reader.open(file.path, shape=grid, **stated))
-            if not recordings:
-                notes.append(file.path)
-                continue
-            content = surveyor(recordings, problems, progress)
-        except InputError as error:
+            with foreseeing(file.path):
+                recordings = list(file.reader.open(file.path, shape=grid, **stated))
+                if recordings:
+                    contents.append((file, surveyor(recordings, problems, progress)))
+                else:
+                    notes.append(file.path)
+        except InputError as error:  # the other files are read
             problems.append(Problem("error", str(error)))
-        # whatever the library of a format raises, the other files are read
-        except Exception as error:
-            unexpected = InputError.unexpected(file.path, error)
-            problems.append(Problem("error", str(unexpected)))
-        else:
-            contents.append((file, content))
     problems += _passed_over(notes)
     targets_of = None
     if values is not None:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptfault.data.recordings.errors import NO_FRAMES, InputError, Problem
+from adaptfault.data.recordings.errors import NO_FRAMES, InputError, Problem, foreseeing
 from adaptfault.data.recordings.facts.rates import Elapsed
 from adaptfault.data.recordings.recording import Block, Facts, Recording, Shape
 from diagnostics import SensorLayout
@@ -247,13 +247,10 @@ class Surveyor:
         failed: list[InputError] = []
         for recording in recordings:
             try:
-                survey, recording = self._survey(recording, problems, step)
-            except InputError as error:
+                with foreseeing(recording.facts.path):
+                    survey, recording = self._survey(recording, problems, step)
+            except InputError as error:  # the other recordings are read
                 failed.append(error)
-                continue
-            # whatever a library raises, the other recordings are read
-            except Exception as error:
-                failed.append(InputError.unexpected(recording.facts.path, error))
                 continue
             surveyed.append(survey)
             kept.append(recording)

@@ -1,5 +1,5 @@
-"""Finds the recordings in a file of named arrays, the same way for HDF5, Zarr, MAT, netCDF and
-Parquet: which arrays are readings, where times, episodes and classes are.
+"""Finds the recordings in a file of named arrays, the same way for HDF5, Zarr, MAT, netCDF,
+Parquet and JSON lines: which arrays are readings, where times, episodes and classes are.
 
 Episodes are
 
@@ -15,7 +15,6 @@ Arrays of one episode whose names differ are the pads of one array.
 from __future__ import annotations
 
 import math
-from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from itertools import pairwise
@@ -23,7 +22,7 @@ from pathlib import Path
 
 import numpy as np
 
-from adaptfault.data.recordings.errors import NO_FRAMES, InputError, Problem, located
+from adaptfault.data.recordings.errors import InputError, Problem, located
 from adaptfault.data.recordings.facts.episodes import Division, Episode, numbered
 from adaptfault.data.recordings.facts.labels import natural_key
 from adaptfault.data.recordings.facts.roles import (
@@ -52,7 +51,6 @@ from adaptfault.data.recordings.formats.datasets.contents import (
     TEXTS,
     UNITS,
     Contents,
-    Opened,
     Packing,
     texts,
 )
@@ -64,8 +62,8 @@ from adaptfault.data.recordings.formats.datasets.features import (
     choose,
     is_touch,
 )
-from adaptfault.data.recordings.formats.datasets.parts import Part, Readings, blocks, refused
-from adaptfault.data.recordings.recording import Facts, Recording, Shape
+from adaptfault.data.recordings.formats.datasets.parts import Part, Readings
+from adaptfault.data.recordings.recording import Facts, Shape
 
 _ENDS = ("episode_ends", "lengths", "episode_lengths")
 _INDEX = "index"
@@ -76,52 +74,7 @@ _MOST_AXES = 4  # of a frame: hands, pads, rows, columns
 _LONGEST_UNIT = 16
 
 
-def recordings_of(
-    path: Path,
-    opened: Opened,
-    *,
-    shape: Shape | None,
-    key: str | None,
-    stated: Stated,
-    known: Mapping[str, Sizes] | None = None,
-) -> list[Recording]:
-    """Return the recordings of a file.
-
-    Args:
-        path: of the file, for messages.
-        opened: opens it; raises InputError where it cannot be read.
-        shape: ``(pads, rows, cols)`` where the user states it.
-        key: which arrays hold the readings; None: found by their names.
-        stated: where times and classes are.
-        known: sizes of a frame of each array, where another file states them.
-
-    Raises:
-        InputError: no array of touch, or several that could be meant; times or classes are not
-            where they are stated.
-    """
-    with opened(None) as contents:
-        chooser = _Chooser(path, contents, shape, stated, known)
-        parts = list(chooser.parts(chooser.episodes(key)))
-        if not any(part.last > part.first for part in parts):
-            raise InputError.at(path, NO_FRAMES)
-        common = Counter(chooser.sizes(part) for part in parts if part.last > part.first)
-        sizes = common.most_common(1)[0][0]
-        pads = Pads.of(sizes, shape)
-        usual = next(part for part in parts if chooser.sizes(part) == sizes)
-        facts = chooser.facts(usual, pads)
-        found = []
-        for part in parts:
-            read = partial(blocks, path, opened, chooser.readings(part), pads)
-            if chooser.sizes(part) != sizes and part.last > part.first:
-                read = partial(refused, path, part, chooser.sizes(part), sizes)
-            name = None if part.name is None else f"{path.name}, {part.name}"
-            number = part.number if isinstance(part.number, int) else None
-            row = chooser.row(part)
-            found.append(Recording(facts, read, name, part.label, part.names, number, row))
-    return found
-
-
-class _Chooser:
+class Chooser:
     """What the arrays of one open file are."""
 
     def __init__(
@@ -308,6 +261,7 @@ class _Chooser:
         if pads.is_guessed:
             told.append(f"{', '.join(part.names)}: {GUESSED}")
         told += [division.lost for division in self.divisions if division.lost]
+        told += self.contents.told
         left_out = list(self.contents.left_out.items())
         told += [f"{name} is left out: it {why}" for name, why in left_out[:_SHOWN]]
         if len(left_out) > _SHOWN:

@@ -10,9 +10,11 @@ from __future__ import annotations
 import base64
 import math
 import struct
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field
+from functools import lru_cache
+from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
@@ -59,12 +61,14 @@ class Contents:
         arrays: of numbers, times and texts, by their names with groups, as "data/tactile".
         attributes: of each group and array that has some; "" is the file itself.
         left_out: arrays that cannot be read, and why.
+        told: other warnings.
         is_table: its first axis counts rows, so it is the time.
     """
 
     arrays: dict[str, Array] = field(default_factory=dict)
     attributes: dict[str, dict[str, Any]] = field(default_factory=dict)
     left_out: dict[str, str] = field(default_factory=dict)
+    told: list[str] = field(default_factory=list)
     is_table: bool = False
 
     def add(self, name: str, array: Array, attributes: Mapping[str, Any] | None = None) -> None:
@@ -120,6 +124,23 @@ class Contents:
 Opened = Callable[[Sequence[str] | None], AbstractContextManager[Contents]]
 """Opens a file, and returns all that it holds, or the arrays of some names alone."""
 
+Opener = Callable[[Path, Sequence[str] | None], AbstractContextManager[Contents]]
+"""Opens a file of a format, as :data:`Opened` does."""
+
+
+def kept(read: Callable[[Path], Contents]) -> Opener:
+    """Return what opens files whose contents can be read later, too: those of the last file stay
+    in memory, and are read anew where all are asked for."""
+    held = lru_cache(maxsize=1)(read)
+
+    @contextmanager
+    def opened(path: Path, names: Sequence[str] | None = None) -> Iterator[Contents]:
+        if names is None:  # the file may have changed since
+            held.cache_clear()
+        yield held(path)
+
+    return opened
+
 
 def element(name: str, place: int) -> str:
     """Return the name of an element of an array of arrays: a group that counts, as of episodes."""
@@ -133,8 +154,9 @@ def plain(value: Any) -> Any:
 
 
 def texts(values: Any) -> list[str]:
-    """Return the values of an array as text."""
-    return [str(plain(value)) for value in np.asarray(values).ravel().tolist()]
+    """Return the values of an array as text; one that is missing is empty."""
+    held = np.asarray(values).ravel().tolist()
+    return ["" if value is None else str(plain(value)) for value in held]
 
 
 @dataclass(frozen=True)

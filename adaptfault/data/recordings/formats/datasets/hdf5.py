@@ -10,21 +10,18 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptfault.data.recordings.errors import InputError
+from adaptfault.data.recordings.errors import InputError, foreseeing
 from adaptfault.data.recordings.facts.declared import too_large, too_much
 from adaptfault.data.recordings.formats.datasets import netcdf
-from adaptfault.data.recordings.formats.datasets.beside import Stated
-from adaptfault.data.recordings.formats.datasets.chooser import recordings_of
 from adaptfault.data.recordings.formats.datasets.contents import Contents, element
 from adaptfault.data.recordings.formats.datasets.extra import imported
-from adaptfault.data.recordings.recording import Recording, Shape
+from adaptfault.data.recordings.formats.datasets.reader import reader
 
 SUFFIXES = (".h5", ".hdf5", ".hdf", ".he5", ".nc", ".nc4", ".cdf")
 
@@ -33,41 +30,17 @@ _EMPTY = "MATLAB_empty"  # attribute of one that stores its sizes, because it ho
 _HIDDEN = "#"  # begins the names of MATLAB's own groups
 
 
-def open(
-    path: Path,
-    *,
-    shape: Shape | None = None,
-    key: str | None = None,
-    time_column: str | None = None,
-    label_column: str | None = None,
-    **stated: Any,
-) -> list[Recording]:
-    """Return the recordings of a file: one, one a group (``demo_0``, ``episode_3``), or those that
-    ``episode_ends`` divides.
-
-    Args:
-        path: the file.
-        shape: ``(pads, rows, cols)`` where the user states it.
-        key: names of the arrays that hold the readings, one a pad; None: found by their names
-            (:mod:`adaptfault.data.recordings.formats.datasets.features`).
-        time_column, label_column: arrays or attributes of times and classes; None: found by name.
-        stated: what other readers ask for.
-
-    Raises:
-        InputError: h5py is not installed, the file is damaged or being written, or the arrays are
-            not clear.
-    """
-    held = partial(netcdf.opened if netcdf.is_classic(path) else opened, path)
-    return recordings_of(path, held, shape=shape, key=key, stated=Stated(time_column, label_column))
-
-
 @contextmanager
 def opened(path: Path, names: Sequence[str] | None = None) -> Iterator[Contents]:
     """Open a file for reading; ``names``: of the arrays that are wanted, None: all it holds.
 
     Raises:
-        InputError: as :func:`open`.
+        InputError: h5py is not installed, the file is damaged or being written.
     """
+    if netcdf.is_classic(path):
+        with netcdf.opened(path, names) as contents:
+            yield contents
+        return
     h5py = imported("h5py", path)
     try:
         file = h5py.File(path, "r")
@@ -78,14 +51,13 @@ def opened(path: Path, names: Sequence[str] | None = None) -> Iterator[Contents]
         if names is not None:
             contents.arrays.update({name: _array(_found(file, name)) for name in names})
         else:
-            try:
+            with foreseeing(path, "is damaged ({}); copy it again"):
                 contents.attributes[""] = dict(file.attrs)
                 _collect(file, contents)
-            # a damaged file raises any of a dozen kinds
-            except Exception as error:
-                what = f"is damaged ({type(error).__name__}); copy it again"
-                raise InputError.at(path, what) from None
         yield contents
+
+
+open = reader(opened)
 
 
 def _collect(file: Any, contents: Contents) -> None:

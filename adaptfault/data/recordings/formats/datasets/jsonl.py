@@ -1,220 +1,142 @@
-"""Reads JSON lines: an object a line with a list of readings, or the list alone; one frame a
-line."""
+"""Opens JSON lines: an object a line with a list of readings, or the list alone; one frame a line.
+
+``null`` is a missing reading. A last line that was cut off is left out with a warning.
+"""
 
 from __future__ import annotations
 
 import builtins
 import json
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator
+from contextlib import suppress
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from adaptfault.data.recordings.errors import NO_FRAMES, InputError, Problem, located
-from adaptfault.data.recordings.facts.episodes import Division, Episode, divide, numbered
-from adaptfault.data.recordings.facts.roles import (
-    EPISODES,
-    LABELS,
-    clock_of,
-    first_of,
-    named,
-    unit_of,
-)
-from adaptfault.data.recordings.formats.datasets.features import Pads, Sizes, choose
-from adaptfault.data.recordings.recording import BLOCK, Block, Facts, Recording, Shape
+from adaptfault.data.recordings.errors import NO_FRAMES, InputError
+from adaptfault.data.recordings.formats.datasets.contents import Contents, kept
+from adaptfault.data.recordings.formats.datasets.reader import reader
+from adaptfault.data.recordings.recording import BLOCK
 
 SUFFIXES = (".jsonl", ".ndjson")
 
 _READINGS = "readings"  # of a line that is a list alone
 
 
-def open(
-    path: Path,
-    *,
-    shape: Shape | None = None,
-    key: str | None = None,
-    time_column: str | None = None,
-    label_column: str | None = None,
-    **stated: Any,
-) -> list[Recording]:
-    """Return the recordings of a file: one, or one a value of ``episode`` (``episode_index``,
-    ``recording``, ``trial``).
+@kept
+def opened(path: Path) -> Contents:
+    """Return what the lines of a file hold; a field is read where it is looked at.
 
-    ``null`` is a missing reading. A last line that was cut off is left out with a warning.
+    Raises:
+        InputError: the file holds no frame, or a line is no JSON.
+    """
+    contents = Contents(is_table=True)
+    places = []
+    first: dict[str, Any] = {}
+    with builtins.open(path, "rb") as file:
+        for number, begin, line in _parsed(path, file, contents.told):
+            places.append((number, begin))
+            first |= {name: value for name, value in line.items() if first.get(name) is None}
+    if not places:
+        raise InputError.at(path, NO_FRAMES)
+    lines = _Lines(path, np.array(places))
+    for name, value in first.items():
+        contents.add(name, _Field(lines, name, value))
+    return contents
+
+
+open = reader(opened)
+
+
+def _parsed(path: Path, file: Any, told: list[str]) -> Iterator[tuple[int, int, dict[str, Any]]]:
+    """Yield number, first byte and content of each line; a last one that was cut off is left out,
+    which is ``told``."""
+    end = 0
+    for number, data in enumerate(file, 1):
+        begin = end
+        end += len(data)
+        text = data.decode("utf-8-sig", "replace")
+        if not text.strip():
+            continue
+        try:
+            line = json.loads(text)
+        except (ValueError, RecursionError):
+            if not text.endswith("\n") and number > 1:
+                told.append("the last line is cut off: the lines before it are kept")
+                return
+            raise InputError.at(path, "is no JSON; correct it", f"line {number}") from None
+        if isinstance(line, list):
+            line = {_READINGS: line}
+        if not isinstance(line, dict):
+            what = "expected an object or a list of readings"
+            raise InputError.at(path, what, f"line {number}")
+        yield number, begin, line
+
+
+class _Lines:
+    """The lines of a file.
 
     Args:
         path: the file.
-        shape: ``(pads, rows, cols)`` where the user states it.
-        key: names of the fields that hold the readings, one a pad; None: found by their names
-            (:mod:`adaptfault.data.recordings.formats.datasets.features`).
-        time_column, label_column: fields of times and classes; None: found by name.
-        stated: what other readers ask for.
-
-    Raises:
-        InputError: the file holds no frame, a line is no JSON, or the fields are not clear.
+        places: int ``[n, 2]``, number and first byte of each line.
     """
-    problems: list[Problem] = []
-    parts, first, division = _parts(path, problems, label_column)
-    own_clock = named(path, "time-column", time_column, list(first))
-    clock = own_clock or clock_of(list(first))
-    tick = None if clock is None else unit_of(clock)
-    if division.lost:
-        problems.append(Problem("warning", located(path, division.lost)))
-    fields = {name: _sizes(value) for name, value in first.items()}
-    numbers = {name: sizes for name, sizes in fields.items() if sizes is not None}
-    if own_clock is not None:
-        numbers.pop(own_clock, None)
-    names = choose(path, numbers, key)
-    sizes = [numbers[name] for name in names]
-    pads = Pads.of(sizes, shape)
-    facts = Facts(
-        path,
-        shape=pads.shape,
-        present=pads.present,
-        inferred=tuple(filter(None, [division.inferred])),
-        problems=tuple(problems),
-    )
 
-    def blocks(part: _Part) -> Callable[[], Iterator[Block]]:
-        return lambda: _blocks(path, names, sizes, pads, part, clock, tick)
+    def __init__(self, path: Path, places: NDArray[np.int64]) -> None:
+        self.path = path
+        self.places = places
+        self._held: tuple[int, int, list[dict[str, Any]]] = (0, 0, [])
 
-    return [Recording(facts, blocks(part), part.name, part.label) for part in parts]
+    def between(self, first: int, last: int) -> list[dict[str, Any]]:
+        """Return some lines; the last ones stay in memory: fields share them."""
+        if self._held[:2] != (first, last):
+            with builtins.open(self.path, "rb") as file:
+                file.seek(self.places[first, 1])
+                some = islice(_parsed(self.path, file, []), last - first)
+                self._held = first, last, [line for _, _, line in some]
+        return self._held[2]
 
 
-@dataclass(frozen=True)
-class _Place:
-    """A line of a file: its number, from 1, and the byte at which it begins."""
+class _Field:
+    """The values of a field, ``[lines, ...]``; a slice of it is read.
 
-    number: int = 1
-    byte: int = 0
-
-
-@dataclass(frozen=True)
-class _Part:
-    """The lines of one recording, which begin at ``first`` and end before ``end``; None: the last
-    one."""
-
-    name: str | None
-    label: str | None
-    first: _Place
-    end: _Place | None
-
-
-def _parts(
-    path: Path, problems: list[Problem], label_column: str | None
-) -> tuple[list[_Part], dict[str, Any], Division]:
-    """Return the recordings of a file, its first line, and how it is divided.
-
-    Raises:
-        InputError: it holds no frame, a line is no JSON, or the field of the class is not there.
+    Args:
+        lines: of the file.
+        name: of the field.
+        first: its first value, which tells the sizes of all.
     """
-    places: list[_Place] = []
-    numbers: list[Any] = []
-    classes: list[Any] = []
-    first: dict[str, Any] = {}
-    for place, line in _lines(path, _Place(), problems):
-        first = first or line
-        places.append(place)
-        numbers.append(line.get(first_of(EPISODES, list(line)) or ""))
-        stated = named(path, "label-column", label_column, list(line))
-        classes.append(line.get(stated or first_of(LABELS, list(line)) or ""))
-    if not places:
-        raise InputError.at(path, NO_FRAMES)
-    has_numbers = any(number is not None for number in numbers)
-    episodes = numbered(numbers) if has_numbers else [Episode(0, len(places))]
-    division = divide(episodes, classes)
-    parts = []
-    for episode in division.episodes:
-        name = None if episode.name is None else f"{path.name}, {episode.name}"
-        end = places[episode.last] if episode.last < len(places) else None
-        parts.append(_Part(name, episode.label, places[episode.first], end))
-    return parts, first, division
 
+    def __init__(self, lines: _Lines, name: str, first: Any) -> None:
+        self._lines = lines
+        self._name = name
+        sizes: tuple[int, ...] = ()
+        self.dtype: np.dtype[Any] = np.dtype(object)
+        with suppress(TypeError, ValueError):
+            sizes = np.array(first, np.float64).shape
+            self.dtype = np.dtype(np.float64)
+        if isinstance(first, str):
+            self.dtype = np.dtype(object)
+        self.shape = (len(lines.places), *sizes)
 
-def _sizes(value: Any) -> Sizes | None:
-    """Return the sizes of a list of numbers; None for what is none."""
-    try:
-        array = np.array(value, dtype=np.float64)  # null becomes NaN
-    except (TypeError, ValueError):
-        return None
-    return array.shape if not isinstance(value, str) else None
+    def __getitem__(self, part: slice) -> NDArray[Any]:
+        first, last, _ = part.indices(len(self._lines.places))
+        values = np.empty((last - first, *self.shape[1:]), self.dtype)
+        for begin in range(first, last, BLOCK):
+            some = self._lines.between(begin, min(begin + BLOCK, last))
+            for row, line in enumerate(some, begin):
+                values[row - first] = self._value(row, line.get(self._name))
+        return values
 
-
-def _lines(
-    path: Path, begin: _Place, problems: list[Problem]
-) -> Iterator[tuple[_Place, dict[str, Any]]]:
-    """Yield place and content of each line from ``begin`` on; a last one that was cut off is left
-    out, with a warning in ``problems``."""
-    with builtins.open(path, "rb") as file:
-        file.seek(begin.byte)
-        byte = begin.byte
-        for number, data in enumerate(file, begin.number):
-            place = _Place(number, byte)
-            byte += len(data)
-            text = data.decode("utf-8-sig", "replace")
-            if not text.strip():
-                continue
-            try:
-                line = json.loads(text)
-            except (ValueError, RecursionError):
-                if not text.endswith("\n") and number > 1:
-                    what = "the last line is cut off: the lines before it are kept"
-                    problems.append(Problem("warning", located(path, what)))
-                    return
-                raise InputError.at(path, "is no JSON; correct it", f"line {number}") from None
-            if isinstance(line, list):
-                line = {_READINGS: line}
-            if not isinstance(line, dict):
-                what = "expected an object or a list of readings"
-                raise InputError.at(path, what, f"line {number}")
-            yield place, line
-
-
-def _blocks(
-    path: Path,
-    names: list[str],
-    sizes: list[Sizes],
-    pads: Pads,
-    part: _Part,
-    clock: str | None,
-    tick: str | None,
-) -> Iterator[Block]:
-    held: list[tuple[int, list[Any], Any]] = []
-    for place, line in _lines(path, part.first, []):
-        if part.end is not None and place.byte >= part.end.byte:
-            break
-        held.append((place.number, [line.get(name) for name in names], line.get(clock or "")))
-        if len(held) == BLOCK:
-            yield _block(path, held, sizes, names, pads, tick)
-            held = []
-    if held:
-        yield _block(path, held, sizes, names, pads, tick)
-
-
-def _block(
-    path: Path,
-    held: list[tuple[int, list[Any], Any]],
-    sizes: list[Sizes],
-    names: list[str],
-    pads: Pads,
-    tick: str | None,
-) -> Block:
-    features = [np.empty((len(held), *size), np.float32) for size in sizes]
-    for row, (number, values, _) in enumerate(held):
-        for feature, value, name in zip(features, values, names, strict=True):
-            try:
-                feature[row] = np.asarray(value, dtype=np.float64).reshape(feature.shape[1:])
-            except (TypeError, ValueError):
-                expected = list(feature.shape[1:])
-                what = f"{name} holds no {expected} numbers; correct it, or remove the line"
-                raise InputError.at(path, what, f"line {number}") from None
-    times = [time for _, _, time in held]
-    known = all(isinstance(time, int | float) for time in times) and pads.steps == 1
-    return Block(
-        pads.frames(features),
-        None,
-        np.array(times, dtype=np.float64) if known else None,
-        tick,
-    )
+    def _value(self, row: int, value: Any) -> Any:
+        """Return the value of a line; one that is missing is NaN."""
+        if self.dtype.kind == "O":
+            return value
+        sizes = self.shape[1:]
+        try:
+            return np.asarray(value, dtype=np.float64).reshape(sizes)
+        except (TypeError, ValueError):
+            what = f"{self._name} holds no {list(sizes)} numbers; correct it, or remove the line"
+            number = self._lines.places[row, 0]
+            raise InputError.at(self._lines.path, what, f"line {number}") from None

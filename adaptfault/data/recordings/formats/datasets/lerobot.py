@@ -16,9 +16,9 @@ from adaptfault.data.recordings.facts.labels import natural_key
 from adaptfault.data.recordings.facts.roles import named
 from adaptfault.data.recordings.formats.datasets import parquet
 from adaptfault.data.recordings.formats.datasets.beside import Stated
-from adaptfault.data.recordings.formats.datasets.chooser import recordings_of
 from adaptfault.data.recordings.formats.datasets.extra import imported
 from adaptfault.data.recordings.formats.datasets.features import GUESSED, Pads, Sizes, choose
+from adaptfault.data.recordings.formats.datasets.reader import recordings_of
 from adaptfault.data.recordings.formats.text import read_json_object
 from adaptfault.data.recordings.recording import Block, Facts, Recording, Shape
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptfault.data.recordings.errors import InputError
+from adaptfault.data.recordings.errors import InputError, foreseeing
 from adaptfault.data.recordings.facts.labels import natural_key
 from adaptfault.data.recordings.formats.datasets.extra import imported
 from adaptfault.data.recordings.formats.datasets.features import VALID
@@ -69,13 +69,8 @@ def write_table(
         rows: which readings are valid.
         of_all, of_each: statistics that take in the readings, of all and of each episode.
     """
-    try:
+    with foreseeing(source):
         _write_groups(place, source, rows, of_all, of_each)
-    except InputError:
-        raise
-    # a damaged file raises any of pyarrow's kinds
-    except Exception as error:
-        raise InputError.unexpected(source, error) from None
 
 
 def _write_groups(

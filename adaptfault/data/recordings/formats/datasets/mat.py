@@ -5,20 +5,17 @@ from __future__ import annotations
 import zlib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from adaptfault.data.recordings.errors import InputError
+from adaptfault.data.recordings.errors import InputError, foreseeing
 from adaptfault.data.recordings.facts.sizes import MOST_BYTES
 from adaptfault.data.recordings.formats.datasets import hdf5
-from adaptfault.data.recordings.formats.datasets.beside import Stated
-from adaptfault.data.recordings.formats.datasets.chooser import recordings_of
-from adaptfault.data.recordings.formats.datasets.contents import Contents, element
+from adaptfault.data.recordings.formats.datasets.contents import Contents, element, kept
+from adaptfault.data.recordings.formats.datasets.reader import reader
 from adaptfault.data.recordings.formats.text import read_bytes
-from adaptfault.data.recordings.recording import Recording, Shape
 
 SUFFIXES = (".mat",)
 
@@ -29,57 +26,34 @@ _COMPRESSED = 15  # type of an element
 _PIECE = 1 << 20  # bytes that are unpacked at once, to count them
 
 
-def open(
-    path: Path,
-    *,
-    shape: Shape | None = None,
-    key: str | None = None,
-    time_column: str | None = None,
-    label_column: str | None = None,
-    **stated: Any,
-) -> list[Recording]:
-    """Return the recordings of a file; fields of structures are named ``structure/field``, elements
-    of an array of structures or of a cell array ``array/0``, ``array/1``.
-
-    Args:
-        path: the file.
-        shape: ``(pads, rows, cols)`` where the user states it.
-        key: names of the variables that hold the readings, one a pad; None: found by their names
-            (:mod:`adaptfault.data.recordings.formats.datasets.features`).
-        time_column, label_column: variables of times and classes; None: found by name.
-        stated: what other readers ask for.
+@contextmanager
+def opened(path: Path, names: Sequence[str] | None = None) -> Iterator[Contents]:
+    """Open a file; fields of structures are named ``structure/field``, elements of an array of
+    structures or of a cell array ``array/0``, ``array/1``.
 
     Raises:
-        InputError: the file is damaged, or the variables are not clear.
+        InputError: the file is damaged.
     """
     with path.open("rb") as file:
         head = file.read(_HEADER + len(_HDF5))
     is_hdf5 = head.startswith(_HDF5) or head[_HEADER:].startswith(_HDF5)
-    _read.cache_clear()  # the file may have changed since
-    return recordings_of(
-        path,
-        partial(hdf5.opened if is_hdf5 else _opened, path),
-        shape=shape,
-        key=key,
-        stated=Stated(time_column, label_column),
-    )
+    with (hdf5.opened if is_hdf5 else _read)(path, names) as contents:
+        yield contents
 
 
-@contextmanager
-def _opened(path: Path, names: Sequence[str] | None) -> Iterator[Contents]:
-    yield _read(path)
+open = reader(opened)
 
 
-@lru_cache(maxsize=1)
+@kept
 def _read(path: Path) -> Contents:
-    """Return the content of a file; the last one stays in memory."""
+    """Return the content of a file of version 5."""
     from io import BytesIO
 
     from scipy.io import loadmat
 
     data = read_bytes(path)
     contents = Contents()
-    try:
+    with foreseeing(path, "is no MAT file, or is damaged ({}); save it again"):
         if _unpacked(data) > MOST_BYTES:
             what = f"unpacks to more than {MOST_BYTES:,} bytes; split it into several files"
             raise InputError.at(path, what)
@@ -87,12 +61,6 @@ def _read(path: Path) -> Contents:
         for name, value in stored.items():
             if not name.startswith("__"):
                 _add(contents, name, value)
-    except InputError:
-        raise
-    # a damaged file raises any of a dozen kinds: scipy's, zlib's, struct's
-    except Exception as error:
-        what = f"is no MAT file, or is damaged ({type(error).__name__}); save it again"
-        raise InputError.at(path, what) from None
     return contents
 
 

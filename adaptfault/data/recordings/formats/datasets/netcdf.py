@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from io import BytesIO
 from pathlib import Path
 from typing import Any
 
-from adaptfault.data.recordings.errors import InputError
-from adaptfault.data.recordings.formats.datasets.contents import Contents
+from adaptfault.data.recordings.errors import foreseeing
+from adaptfault.data.recordings.formats.datasets.contents import Contents, kept
 from adaptfault.data.recordings.formats.text import read_bytes
 
 _MAGIC = b"CDF"
@@ -21,8 +19,8 @@ def is_classic(path: Path) -> bool:
         return file.read(len(_MAGIC)) == _MAGIC
 
 
-@contextmanager
-def opened(path: Path, names: Sequence[str] | None = None) -> Iterator[Contents]:
+@kept
+def opened(path: Path) -> Contents:
     """Open a file for reading; it is read whole.
 
     Raises:
@@ -31,17 +29,13 @@ def opened(path: Path, names: Sequence[str] | None = None) -> Iterator[Contents]
     from scipy.io import netcdf_file
 
     contents = Contents()
-    data = read_bytes(path)
-    try:
-        with netcdf_file(BytesIO(data), mmap=False) as file:
-            contents.attributes[""] = _attributes(file)
-            for name, variable in file.variables.items():
-                contents.add(name, variable.data, _attributes(variable))
-    # a damaged file raises any of a dozen kinds
-    except Exception as error:
-        what = f"is no netCDF file, or is damaged ({type(error).__name__}); write it again"
-        raise InputError.at(path, what) from None
-    yield contents
+    data = BytesIO(read_bytes(path))
+    damaged = "is no netCDF file, or is damaged ({}); write it again"
+    with foreseeing(path, damaged), netcdf_file(data, mmap=False) as file:
+        contents.attributes[""] = _attributes(file)
+        for name, variable in file.variables.items():
+            contents.add(name, variable.data, _attributes(variable))
+    return contents
 
 
 def _attributes(owner: Any) -> dict[str, Any]:

@@ -10,51 +10,24 @@ import builtins
 import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from functools import lru_cache, partial
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptfault.data.recordings.errors import InputError
+from adaptfault.data.recordings.errors import InputError, foreseeing
 from adaptfault.data.recordings.facts.declared import too_large, too_much
 from adaptfault.data.recordings.facts.sizes import check_kind
-from adaptfault.data.recordings.formats.datasets.beside import Stated
-from adaptfault.data.recordings.formats.datasets.chooser import recordings_of
 from adaptfault.data.recordings.formats.datasets.contents import Contents
 from adaptfault.data.recordings.formats.datasets.extra import imported
 from adaptfault.data.recordings.formats.datasets.features import Sizes, is_touch
-from adaptfault.data.recordings.recording import Recording, Shape
+from adaptfault.data.recordings.formats.datasets.reader import reader
 
 SUFFIXES = (".parquet", ".pq")
 
-
-def open(
-    path: Path,
-    *,
-    shape: Shape | None = None,
-    key: str | None = None,
-    time_column: str | None = None,
-    label_column: str | None = None,
-    **stated: Any,
-) -> list[Recording]:
-    """Return the recordings of a file, one an episode.
-
-    Args:
-        path: the file.
-        shape: ``(pads, rows, cols)`` where the user states it.
-        key: names of the columns that hold the readings; None: found by their names
-            (:mod:`adaptfault.data.recordings.formats.datasets.features`).
-        time_column, label_column: columns of times and classes; None: found by name.
-        stated: what other readers ask for.
-
-    Raises:
-        InputError: pyarrow is not installed, the file is damaged, or the columns are not clear.
-    """
-    return recordings_of(
-        path, partial(opened, path), shape=shape, key=key, stated=Stated(time_column, label_column)
-    )
+_DAMAGED = "is no Parquet file, or is cut off; copy it again"
 
 
 @contextmanager
@@ -67,30 +40,29 @@ def opened(path: Path, names: Sequence[str] | None = None) -> Iterator[Contents]
     parquet = imported("pyarrow.parquet", path)
     contents = Contents(is_table=True)
     check_kind(path)
-    try:
-        with builtins.open(path, "rb") as file:
-            held = parquet.ParquetFile(file, pre_buffer=False)
-            about = held.metadata
-            groups = tuple(about.row_group(i).num_rows for i in range(about.num_row_groups))
-            columns = held.schema_arrow
-            every = columns.names
-            wanted = tuple(every) if names is None else tuple(names)
-            for field in columns:
-                if field.name not in wanted:
-                    continue
-                if every.count(field.name) > 1:
-                    contents.left_out[field.name] = "stands twice in the file; rename one of them"
-                    continue
-                column = _Column.of(path, held, field, groups, () if names is None else wanted)
-                if column is None:
-                    if is_touch(field.name):
-                        contents.left_out[field.name] = f"is {field.type}, no column of numbers"
-                else:
-                    _add(contents, field.name, column, path.stat().st_size)
-    # a damaged file raises any of pyarrow's kinds
-    except Exception as error:
-        raise _damaged(path, error) from None
+    with foreseeing(path, _DAMAGED), builtins.open(path, "rb") as file:
+        held = parquet.ParquetFile(file, pre_buffer=False)
+        about = held.metadata
+        groups = tuple(about.row_group(i).num_rows for i in range(about.num_row_groups))
+        columns = held.schema_arrow
+        every = columns.names
+        wanted = tuple(every) if names is None else tuple(names)
+        for field in columns:
+            if field.name not in wanted:
+                continue
+            if every.count(field.name) > 1:
+                contents.left_out[field.name] = "stands twice in the file; rename one of them"
+                continue
+            column = _Column.of(path, held, field, groups, () if names is None else wanted)
+            if column is None:
+                if is_touch(field.name):
+                    contents.left_out[field.name] = f"is {field.type}, no column of numbers"
+            else:
+                _add(contents, field.name, column, path.stat().st_size)
     yield contents
+
+
+open = reader(opened)
 
 
 def _add(contents: Contents, name: str, column: _Column, stored: int) -> None:
@@ -228,13 +200,10 @@ def _first(held: Any, name: str) -> Sizes:
 def _group(path: Path, group: int, names: tuple[str, ...]) -> Any:
     """Return the columns of a row group; the last ones stay in memory: episodes share them."""
     parquet = imported("pyarrow.parquet", path)
-    try:
-        with builtins.open(path, "rb") as file:
-            return parquet.ParquetFile(file, pre_buffer=False).read_row_group(
-                group, columns=list(names), use_threads=False
-            )
-    except Exception as error:
-        raise _damaged(path, error) from None
+    with foreseeing(path, _DAMAGED), builtins.open(path, "rb") as file:
+        return parquet.ParquetFile(file, pre_buffer=False).read_row_group(
+            group, columns=list(names), use_threads=False
+        )
 
 
 def _array(path: Path, column: Any, about: _Column, first: int) -> NDArray[Any]:
@@ -288,9 +257,3 @@ def _numpy(pa: Any, column: Any) -> NDArray[Any]:
         column = column.cast(pa.float64())
     values: NDArray[Any] = column.to_numpy(zero_copy_only=False)
     return values
-
-
-def _damaged(path: Path, error: Exception) -> InputError:
-    if isinstance(error, InputError):
-        return error
-    return InputError.at(path, "is no Parquet file, or is cut off; copy it again")

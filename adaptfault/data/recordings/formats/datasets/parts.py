@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptfault.data.recordings.errors import InputError, Problem, located
+from adaptfault.data.recordings.errors import InputError, Problem, foreseeing, located
 from adaptfault.data.recordings.formats.datasets.axes import TimeLast, Vector
 from adaptfault.data.recordings.formats.datasets.contents import (
     TEXTS,
@@ -103,17 +103,10 @@ def blocks(path: Path, opened: Opened, held: Readings, pads: Pads) -> Iterator[B
         times = None if clock is None else Vector(contents.arrays[clock])
         for first, last in _pieces(part, arrays, pads):
             where = f"{part.name or part.names[0]}, frames {first} to {last - 1}"
-            try:
+            damaged = "cannot be read ({}): damaged, or cut off; copy it again"
+            with foreseeing(path, damaged, where):
                 values = [np.asarray(array[first:last]) for array in arrays]
                 stamps = None if times is None else np.asarray(times[first:last])
-            except InputError:
-                raise
-            # a damaged chunk raises any of a dozen kinds: the codec's, the store's, Python's
-            except Exception as error:
-                what = (
-                    f"cannot be read ({type(error).__name__}): damaged, or cut off; copy it again"
-                )
-                raise InputError.at(path, what, where) from None
             if any(len(value) != last - first for value in values):
                 raise InputError.at(path, "is cut off; copy it again", where)
             packed = zip(held.packings, values, strict=True)

@@ -13,20 +13,16 @@ import math
 import os
 import zipfile
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from adaptfault.data.recordings.errors import InputError
+from adaptfault.data.recordings.errors import foreseeing
 from adaptfault.data.recordings.facts.declared import is_regular, too_large, too_much
-from adaptfault.data.recordings.formats.datasets.beside import Stated
-from adaptfault.data.recordings.formats.datasets.chooser import recordings_of
-from adaptfault.data.recordings.formats.datasets.contents import Contents
+from adaptfault.data.recordings.formats.datasets.contents import Contents, kept
 from adaptfault.data.recordings.formats.datasets.extra import imported
-from adaptfault.data.recordings.recording import Recording, Shape
+from adaptfault.data.recordings.formats.datasets.reader import reader
 
 SUFFIXES = (".zarr.zip",)
 
@@ -40,77 +36,31 @@ def accepts(path: Path) -> bool:
     return any((path / mark).is_file() for mark in _MARKS)
 
 
-def open(
-    path: Path,
-    *,
-    shape: Shape | None = None,
-    key: str | None = None,
-    time_column: str | None = None,
-    label_column: str | None = None,
-    **stated: Any,
-) -> list[Recording]:
-    """Return the recordings of a store: those that ``episode_ends`` divides, one a group, or one.
+_OPEN: list[Any] = []  # the archive that is open
 
-    Args:
-        path: the folder or the archive.
-        shape: ``(pads, rows, cols)`` where the user states it.
-        key: names of the arrays that hold the readings, one a pad; None: found by their names
-            (:mod:`adaptfault.data.recordings.formats.datasets.features`).
-        time_column, label_column: arrays or attributes of times and classes; None: found by name.
-        stated: what other readers ask for.
+
+@kept
+def opened(path: Path) -> Contents:
+    """Return what a folder or an archive holds; its arrays are read where they are looked at.
 
     Raises:
-        InputError: zarr is not installed, the store is damaged, or the arrays are not clear.
+        InputError: zarr is not installed, or the store is damaged.
     """
-    held: dict[str, _Checked] = {}
-    return recordings_of(
-        path,
-        partial(_opened, path, held),
-        shape=shape,
-        key=key,
-        stated=Stated(time_column, label_column),
-    )
-
-
-@contextmanager
-def _opened(
-    path: Path, held: dict[str, _Checked], names: Sequence[str] | None
-) -> Iterator[Contents]:
-    """Open a store; its arrays stay in ``held``, where each recording finds its own."""
-    if names is not None:
-        _keep_open(held[names[0]].archive)
-        yield Contents({name: held[name] for name in names})
-        return
     zarr = imported("zarr", path)
     contents = Contents()
-    try:
+    with foreseeing(path, "is no Zarr store, or is damaged ({}); copy it again"):
         if path.is_dir():
             _collect_folder(zarr, path, contents)
         else:
+            while _OPEN:
+                _OPEN.pop().close()
             archive = zarr.storage.ZipStore(path, mode="r")
             _collect_archive(zarr, path, archive, contents)
-            _keep_open(archive)
-    except InputError:
-        raise
-    # a damaged store raises any of a dozen kinds: zarr's, zipfile's, JSON's
-    except Exception as error:
-        what = f"is no Zarr store, or is damaged ({type(error).__name__}); copy it again"
-        raise InputError.at(path, what) from None
-    held.update({n: one for n, one in contents.arrays.items() if isinstance(one, _Checked)})
-    yield contents
+            _OPEN.append(archive)
+    return contents
 
 
-_OPEN: list[Any] = []  # the archive that was used last
-
-
-def _keep_open(archive: Any) -> None:
-    """Close the archive that was used before another: zarr opens it again where it is read, which
-    takes long where it has many entries."""
-    if archive is None or archive in _OPEN:
-        return
-    for other in _OPEN:
-        other.close()
-    _OPEN[:] = [archive]
+open = reader(opened)
 
 
 def _is_array(folder: Path) -> bool:
@@ -221,7 +171,6 @@ class _Checked:
     def __init__(self, stored: Any, store: Path) -> None:
         self._stored = stored
         self._folder = store / stored.path if store.is_dir() else None
-        self.archive = None if store.is_dir() else stored.store_path.store
         self.shape: tuple[int, ...] = tuple(map(int, stored.shape))
         self.dtype: np.dtype[Any] = stored.dtype
         self.chunks: tuple[int, ...] = getattr(stored, "shards", None) or stored.chunks

@@ -435,7 +435,7 @@ class SelfDiagnosis:
         log = checked_recordings(recordings, self.layout)
         if self.reference_ is not None or len(log) < OWN_REFERENCE:
             return self
-        held = self._held(log, tolerance_of(log, self.layout), classes)
+        held = self._held(self.spans(log), tolerance_of(log, self.layout), classes)
         first = RecordingBlocks([log.given[i] for i in own_reference(log, held, classes)])
         if not _shows_contacts(first, log, self.layout):
             return self
@@ -458,7 +458,7 @@ class SelfDiagnosis:
             ValueError: recordings that do not fit the layout.
         """
         log = checked_recordings(recordings, self.layout)
-        held = self._held(log, tolerance_of(log, self.layout), classes)
+        held = self._held(self.spans(log), tolerance_of(log, self.layout), classes)
         return reference_findings(held, self.layout)
 
     def rewiring(self, recordings: ArrayLike | Sequence[ArrayLike]) -> Rewiring | None:
@@ -590,6 +590,26 @@ class SelfDiagnosis:
         """
         with one_thread():
             return self._evaluated(stream, n_recordings, life)
+
+    def evaluate_recordings(
+        self, stream: StreamState, spans: Spans, lengths: Sequence[int], tolerance: float
+    ) -> Diagnosis:
+        """Return the diagnosis of the log behind ``stream`` with the recordings in which faults
+        show.
+
+        Args:
+            stream: the state of the log.
+            spans: of its recordings (:meth:`spans`).
+            lengths: frames of each.
+            tolerance: half range of a constant reading (:meth:`tolerance`).
+
+        Raises:
+            ValueError: as :meth:`evaluate`.
+        """
+        held = self._held(spans, tolerance, None)
+        stream.held = np.asarray(held.suspect.any(axis=0))[self._order]
+        whole = self.evaluate(stream, n_recordings=len(lengths))
+        return with_recordings(whole, held, lengths, tolerance, None)
 
     def _evaluated(self, stream: StreamState, n_recordings: int, life: Life | None) -> Diagnosis:
         """Return the diagnosis; arguments as in :meth:`evaluate`."""
@@ -867,29 +887,37 @@ class SelfDiagnosis:
         self, log: RecordingBlocks, classes: ArrayLike | None, crosstalk: Crosstalk | None
     ) -> Diagnosis:
         """Return the diagnosis of a log with the recordings in which faults show."""
-        tolerance = tolerance_of(log, self.layout)
-        if self.reference_ is not None:
-            tolerance = self.reference_.tolerance
-        held = self._held(log, tolerance, classes)
+        tolerance = self.tolerance(log)
+        held = self._held(self.spans(log), tolerance, classes)
 
         def judged(some: RecordingBlocks) -> Diagnosis:
             return self._judged(some, crosstalk, np.asarray(held.suspect.any(axis=0)))
 
-        whole = judged(log)
-        if self.reference_ is None or len(log) < 2:
-            return whole
-        return with_recordings(
-            whole,
-            held,
-            [len(given) for given in log.given],
-            tolerance,
-            lambda some: judged(RecordingBlocks([log.given[i] for i in some])),
-        )
+        def of_part(some: tuple[int, ...]) -> Diagnosis:
+            return judged(RecordingBlocks([log.given[i] for i in some]))
 
-    def _held(self, log: RecordingBlocks, tolerance: float, classes: ArrayLike | None) -> Held:
+        whole = judged(log)
+        if len(log) < 2:
+            return whole
+        lengths = [len(given) for given in log.given]
+        # without a reference, a part of a log tells less than the whole
+        part = None if self.reference_ is None else of_part
+        return with_recordings(whole, held, lengths, tolerance, part)
+
+    def spans(self, log: RecordingBlocks) -> Spans:
+        """Return the range of the loads of each cell in each recording, each axis of a pad as a pad
+        of its own."""
+        return Spans.of(RecordingBlocks(self._in_planes(log)))
+
+    def tolerance(self, log: RecordingBlocks) -> float:
+        """Return the half range of a constant reading."""
+        if self.reference_ is None:
+            return tolerance_of(log, self.layout)
+        return self.reference_.tolerance
+
+    def _held(self, spans: Spans, tolerance: float, classes: ArrayLike | None) -> Held:
         """Return where cells hold a value although those beside them move."""
-        given = self._in_planes(log)
-        held = find_held(Spans.of(RecordingBlocks(given)), self._planes, tolerance, classes)
+        held = find_held(spans, self._planes, tolerance, classes)
         if self.load_ is not None:
             below = np.zeros(len(held.value), bool)
             held = replace(held, value=self.load_.readings(held.value, below))

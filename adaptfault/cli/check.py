@@ -78,7 +78,6 @@ class Check(Inspecting):
         from adaptfault.inspection.check_log import check_log
         from adaptfault.inspection.findings import FailOn
         from adaptfault.inspection.groupings import coincide, data_sets_of, read_groupings
-        from adaptfault.inspection.held_values import with_held_values
         from adaptfault.inspection.naming import Naming
 
         fails = None if self.fail_on is None else FailOn.parse(self.fail_on)
@@ -100,7 +99,7 @@ class Check(Inspecting):
         groupings = dict(data_sets_of(log, self.recordings))
         if self.groups is not None:
             groupings |= read_groupings(self.groups, log.names)
-        found = with_held_values(inspected.inspection, log, log.layout)
+        found = inspected.inspection
         also = coincide(found.diagnosis, groupings)
         found = replace(found, findings=(*found.findings, *also))
         named = Naming.of(log).of_inspection(found)

@@ -149,7 +149,7 @@ def _inspected(
             parts(),
             cold,
             reference=healthy,
-            n_recordings=len(log),
+            lengths=log.lengths,
             classes=classes_of(log),
             progress=advance,
         )

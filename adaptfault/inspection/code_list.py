@@ -396,7 +396,7 @@ CODES: tuple[Code, ...] = (
         " them move.",
         "They are dead there, or something lies on them: a model learns it for what goes along.",
         "No proof of a fault: the cells count as not tested.",
-        method="adaptfault.inspection.held_values",
+        method="diagnostics.when.held_again",
     ),
     Code(
         190,

@@ -10,7 +10,6 @@ from typing import Any
 from adaptfault.data.recordings import Opened, Recordings, open_recordings
 from adaptfault.inspection.check_log import check_log, classes_of
 from adaptfault.inspection.findings import FailOn, Findings, level_of
-from adaptfault.inspection.held_values import with_held_values
 from adaptfault.inspection.inspection import Finding, inspect
 from adaptfault.inspection.long_log import inspect_parts
 from diagnostics import SelfDiagnosis
@@ -74,9 +73,8 @@ def guard(
         inspection = inspect(list(log.frames), diagnoser, reference=healthy, classes=classes)
     else:
         inspection = inspect_parts(
-            log.parts(), diagnoser, reference=healthy, n_recordings=len(log), classes=classes
+            log.parts(), diagnoser, reference=healthy, lengths=log.lengths, classes=classes
         )
-    inspection = with_held_values(inspection, log, log.layout)
     left_out = 0
     if isinstance(log, Opened):
         left_out = sum(problem.level == "error" for problem in log.problems)

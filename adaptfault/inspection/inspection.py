@@ -46,7 +46,7 @@ OF_FRAMES: Mapping[str, Name] = {
 }
 """Names of the findings of each kind of transport fault."""
 
-OF_CELLS = ("fault", "wire", "static_load", *OF_FRAMES.values(), "untested")
+OF_CELLS = ("fault", "wire", "static_load", *OF_FRAMES.values(), "held_value", "untested")
 """Names of the findings that a diagnosis gives."""
 
 _OF_ALL_CELLS = ("quantised", "saturated", "normalised")
@@ -354,7 +354,7 @@ def _of_change(change: SensorChange | None) -> list[Finding]:
 
 
 def of_diagnosis(diagnosis: Diagnosis) -> list[Finding]:
-    """Return the faults, wires, static loads, lost frames and what was not tested."""
+    """Return the faults, wires, static loads, lost frames, held values and what was not tested."""
     severity = of_faults(diagnosis)
     of_frames = [
         _told(OF_FRAMES[one.kind], one.reason)
@@ -369,6 +369,7 @@ def of_diagnosis(diagnosis: Diagnosis) -> list[Finding]:
     ]
     findings += [_told("static_load", load.reason) for load in diagnosis.static_loads]
     findings += of_frames
+    findings += [_told("held_value", one.reason) for one in diagnosis.possible if one.recordings]
     reason = untested(diagnosis)
     if reason is not None:
         findings.append(_told("untested", reason))

@@ -12,7 +12,9 @@ from numpy.typing import ArrayLike, NDArray
 from adaptfault.inspection.changed_readings import ChangedReadings
 from adaptfault.inspection.inspection import OF_CELLS, Finding, Inspection, inspect, of_diagnosis
 from diagnostics import Diagnosis, SelfDiagnosis
+from diagnostics.preprocessing.readings import RecordingBlocks
 from diagnostics.threads import one_thread
+from diagnostics.when import Spans
 
 _OF_PARTS = ("one_signal", "corrupt_frame", "common_spike", "repeated_frames", "crosstalk")
 """Names of the findings that the diagnosis of the whole log no longer sees."""
@@ -23,7 +25,7 @@ def inspect_parts(
     diagnoser: SelfDiagnosis,
     *,
     reference: ArrayLike | Sequence[ArrayLike] | None = None,
-    n_recordings: int = 1,
+    lengths: Sequence[int] | None = None,
     classes: ArrayLike | None = None,
     progress: Callable[[float], None] = lambda share: None,
 ) -> Inspection:
@@ -31,13 +33,13 @@ def inspect_parts(
     :func:`adaptfault.inspection.inspection.inspect`.
 
     One part is inspected as a whole. Of several, each is inspected for itself: wires and pads are
-    put back, and what its cells share is taken out. The cells are judged from all of them together.
-    The result holds no readings.
+    put back, and what its cells share is taken out. The cells are judged from all of them together,
+    and from the range of each in each recording. The result holds no readings.
 
     Args:
         parts: at least one list of recordings ``[T, D]``, in time order.
         diagnoser, reference, progress: as for ``inspect``.
-        n_recordings: number of recordings in all parts, of which long ones are cut.
+        lengths: frames of each recording in all parts, of which long ones are cut; None: none is.
         classes: as for ``inspect``, of one part; of several they are not used.
 
     Raises:
@@ -50,8 +52,11 @@ def inspect_parts(
     fitted = diagnoser
     if diagnoser.reference_ is None:
         fitted = diagnoser.for_log(first, progress=progress)
+    tolerance = fitted.tolerance(RecordingBlocks(first))
     stream = fitted.stream()
     inspected = []
+    spans = []
+    pieces: list[int] = []
     for part in chain([first, second], parts):
         one = inspect(part, fitted, reference=reference)
         crosstalk = fitted.crosstalk(one.readings.frames)
@@ -61,10 +66,21 @@ def inspect_parts(
             for frames in one.readings.frames:
                 stream.begin_recording()
                 stream.extend(frames)
+        spans.append(fitted.spans(RecordingBlocks(_as_judged(one, part))))
+        pieces += map(len, part)
         inspected.append(_without_frames(one))
     if not stream.received.any():  # all cells show one signal, or none has a reading
         return inspected[0]
-    return _together(inspected, fitted.evaluate(stream, n_recordings=n_recordings))
+    whole = pieces if lengths is None else list(lengths)
+    of_each = Spans.joined(spans).whole(pieces, whole)
+    diagnosis = fitted.evaluate_recordings(stream, of_each, whole, tolerance)
+    return _together(inspected, diagnosis)
+
+
+def _as_judged(inspection: Inspection, part: list[NDArray[Any]]) -> list[NDArray[Any]]:
+    """Return the recordings of a part as they are judged; as they came where some are left out."""
+    frames: list[NDArray[Any]] = inspection.readings.frames
+    return frames if len(frames) == len(part) else part
 
 
 def _without_frames(inspection: Inspection) -> Inspection:

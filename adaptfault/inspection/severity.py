@@ -146,9 +146,10 @@ def of_change(before: float, after: float) -> int:
 
 
 def untested(diagnosis: Diagnosis) -> str | None:
-    """Return that a log tests too few of the cells, or what may be faulty, in one sentence; None
-    where it tests enough."""
+    """Return that a log tests too few of the cells, or what may be faulty all through it, in one
+    sentence; None where it tests enough."""
     share = diagnosis.coverage.test_coverage
     if share < UNTESTED:
         return f"only {share:.0%} of the cells were tested, so faults may be hidden"
-    return "; ".join(fault.reason for fault in diagnosis.possible) or None
+    throughout = [fault.reason for fault in diagnosis.possible if fault.recordings is None]
+    return "; ".join(throughout) or None

@@ -3,7 +3,8 @@
 The whole log tells what is faulty at its end. Recordings in which cells hold a value although those
 beside them move (:mod:`diagnostics.when`) are diagnosed as a log of their own; what that finds
 besides shows in these recordings. Cells whose held values are certain are faulty in any case; what
-is suspect and not proven is possible.
+is suspect and not proven is possible, and so is what holds a value again and again
+(:mod:`diagnostics.when.held_again`).
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
     from diagnostics.layout import SensorLayout
     from diagnostics.when import Held
 
+_LISTED = 5  # places in a sentence
 _PARTS = 4  # sets of recordings that are diagnosed, at most: a size
 _HOLDS = (FaultKind.OPEN, FaultKind.SHORT, FaultKind.STUCK, FaultKind.INTERMITTENT)
 
@@ -97,6 +99,10 @@ def with_recordings(
         _told(replace(fault, reason=f"perhaps {fault.reason}: press on it to tell"), last)
         for fault in _held_faults(unproven, held, whole.layout, tolerance)
     ]
+    again = held.again & ~unproven & ~whole.disturbed.mask
+    again[:, list(found)] = False
+    possible += _again_possible(again, whole.layout)
+    tested &= ~again.any(axis=0)
     tested[[cell for fault in faults for cell in fault.cells]] = True
     result = replace(
         whole,
@@ -105,7 +111,8 @@ def with_recordings(
         tested=tested,
         possible=(*whole.possible, *possible),
     )
-    return replace(result, states=_verdicts(result, held, first))
+    alive = held.moved & ~held.suspect & ~again & (whole.tested | result.fault_set.mask)
+    return replace(result, states=_verdicts(result, alive, first))
 
 
 def _states(held: Held) -> list[_State]:
@@ -196,12 +203,43 @@ def _held_fault(
     )
 
 
-def _verdicts(diagnosis: Diagnosis, held: Held, first: Sequence[int]) -> NDArray[np.uint8]:
+def _again_possible(again: NDArray[np.bool_], layout: SensorLayout) -> list[Fault]:
+    """Return a possible fault for each set of recordings in which cells hold a value again and
+    again (bool ``[n, D]``)."""
+    cells_of: dict[Recordings, list[int]] = {}
+    for cell in np.flatnonzero(again.any(axis=0)).tolist():
+        shown = tuple(np.flatnonzero(again[:, cell]).tolist())
+        cells_of.setdefault(shown, []).append(cell)
+    faults = []
+    for shown, cells in cells_of.items():
+        places = [layout.place(cell) for cell in cells[:_LISTED]]
+        more = f" and {len(cells) - _LISTED} more" if len(cells) > _LISTED else ""
+        hold = "holds" if len(cells) == 1 else "hold"
+        reason = (
+            f"{'; '.join(places)}{more} {hold} the same value away from rest all through recordings"
+            f" {ranges(shown)}, while cells beside move: dead there, or something lies on them; not"
+            " tested"
+        )
+        faults.append(
+            Fault(
+                FaultKind.STUCK,
+                tuple(cells),
+                probability=MAJORITY,
+                reason=reason,
+                evidence=len(shown),
+                recordings=shown,
+            )
+        )
+    return faults
+
+
+def _verdicts(
+    diagnosis: Diagnosis, alive: NDArray[np.bool_], first: Sequence[int]
+) -> NDArray[np.uint8]:
     """Return the verdict of each cell in each recording, ``[n, D]``.
 
     A cell is ALIVE where it moved, is not suspect, and the whole log has tested it.
     """
-    alive = held.moved & ~held.suspect & (diagnosis.verdicts != Verdict.UNTESTED)
     code = np.where(alive, Verdict.ALIVE, Verdict.UNTESTED).astype(np.uint8)
     number = np.arange(len(code))
     ends = np.array(first[1:])

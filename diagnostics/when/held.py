@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,6 +11,7 @@ from scipy.special import expit
 
 from diagnostics.preprocessing.levels import CERTAIN_RATIO, FEWEST, MAJORITY, SUSPICIOUS
 from diagnostics.preprocessing.quantiles import known_quantile
+from diagnostics.when.held_again import held_again
 from diagnostics.when.mixture import QUIET_LEVELS, Found, Mixture, Symbol
 from diagnostics.when.spans import Spans
 
@@ -42,12 +43,15 @@ class Held:
         suspect: bool ``[n, D]``, what nothing should be learned from.
         moved: bool ``[n, D]``, where a cell moved.
         value: float ``[D]``, what it reads in these recordings; NaN: none.
+        again: bool ``[n, D]``, where it holds a value away from rest that it holds again and again
+            (:mod:`diagnostics.when.held_again`): no proof.
     """
 
     evidence: Floats
     suspect: Mask
     moved: Mask
     value: Floats
+    again: Mask
 
     @classmethod
     def nothing(cls, spans: Spans, tolerance: float) -> Held:
@@ -58,12 +62,17 @@ class Held:
             np.zeros(spans.low.shape, bool),
             spans.ranges > 2 * tolerance,
             np.full(n_cells, np.nan),
+            np.zeros(spans.low.shape, bool),
         )
 
     def of(self, cells: NDArray[np.intp]) -> Held:
         """Return the same of some cells."""
         return Held(
-            self.evidence[cells], self.suspect[:, cells], self.moved[:, cells], self.value[cells]
+            self.evidence[cells],
+            self.suspect[:, cells],
+            self.moved[:, cells],
+            self.value[cells],
+            self.again[:, cells],
         )
 
     @property
@@ -99,12 +108,13 @@ def find_held(
         tolerance: a constant cell stays within +- this, in the layout's unit.
         classes: of each recording, ``[n]``; None: unknown.
     """
-    if len(spans) < _FEWEST:
-        return Held.nothing(spans, tolerance)
-    number = None
-    if classes is not None:
-        _, number = np.unique(np.asarray(classes), return_inverse=True)
-    return _Search(spans, layout, tolerance, number).held()
+    found = Held.nothing(spans, tolerance)
+    if len(spans) >= _FEWEST:
+        number = None
+        if classes is not None:
+            _, number = np.unique(np.asarray(classes), return_inverse=True)
+        found = _Search(spans, layout, tolerance, number).held()
+    return replace(found, again=held_again(spans, layout))
 
 
 class _Search:
@@ -198,7 +208,7 @@ class _Search:
         value = np.full(len(evidence), np.nan)
         some = np.isfinite(middles).any(axis=0)
         value[some] = np.nanmedian(middles[:, some], axis=0)
-        return Held(evidence, suspect, self._moved, value)
+        return Held(evidence, suspect, self._moved, value, self._nothing.again)
 
     def _symbols(self, layout: SensorLayout) -> NDArray[np.intp]:
         """Return the symbol of each cell in each recording, ``[n, D]``."""

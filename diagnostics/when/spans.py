@@ -37,6 +37,19 @@ class Spans:
             np.concatenate([part.high for part in parts]),
         )
 
+    def whole(self, pieces: Sequence[int], lengths: Sequence[int]) -> Spans:
+        """Return the spans of whole recordings, of which these are pieces.
+
+        Args:
+            pieces: frames of each, in order.
+            lengths: frames of each recording.
+        """
+        if list(pieces) == list(lengths):
+            return self
+        ends = np.cumsum(pieces)
+        begins = np.searchsorted(ends, np.cumsum(lengths) - np.array(lengths), side="right")
+        return Spans(np.fmin.reduceat(self.low, begins), np.fmax.reduceat(self.high, begins))
+
     def __len__(self) -> int:
         return len(self.low)
 

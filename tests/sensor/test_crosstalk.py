@@ -115,7 +115,7 @@ def test_a_cell_that_reads_only_what_its_lines_give_it_is_not_tested(fitted, cro
 
 def test_a_log_in_parts_shows_it_as_a_whole(fitted, reference, cross):
     parts = iter([cross[:20], cross[20:]])
-    found = inspect_parts(parts, fitted, reference=reference, n_recordings=40)
+    found = inspect_parts(parts, fitted, reference=reference)
     assert set(found.diagnosis.fault_set) == {SHORT, OPEN}
     assert "crosstalk" in {one.name for one in found.findings}
 

@@ -45,6 +45,7 @@ from diagnostics.healthy.reference_faults import find_reference_faults, never_mo
 from diagnostics.layout import SensorLayout
 from diagnostics.model import Model, fit_model
 from diagnostics.model.findings import findings, shown
+from diagnostics.model.objects import judged_with_objects
 from diagnostics.preprocessing.array_likes import plain_array
 from diagnostics.preprocessing.copies import find_copies
 from diagnostics.preprocessing.levels import (
@@ -625,7 +626,7 @@ class SelfDiagnosis:
     def _by_model(self, model: Model, stream: StreamState) -> _Judged:
         """Return what the model says of the log behind a ``stream``."""
         aliases, _ = find_aliasing(stream)
-        judgement = model.judge_record(stream.record())
+        judgement, still = judged_with_objects(model, stream.record(), self._planes)
         found = findings(judgement, stream, self.layout.full_scale, self.false_discovery_rate)
         evidence = {
             "spatial": found.weight,
@@ -635,7 +636,7 @@ class SelfDiagnosis:
         return _Judged(
             found=found,
             aliases=aliases,
-            still=[],
+            still=still,
             shown=shown(judgement),
             contradicting=judgement.disturbed,
             evidence=evidence,

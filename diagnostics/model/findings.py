@@ -37,7 +37,7 @@ def findings(
     rest = log.symbols.rest
     present = stream.present
     silent = stream.silent & present
-    delivers = present & ~silent
+    delivers = log.received & ~silent
     probability = np.where(delivers, judgement.probability, np.where(silent, 1.0, 0.0))
     faulty = np.asarray(faulty_at(np.where(silent, 0.0, probability), rate) & delivers)
     frames = stream.intermittency

@@ -8,8 +8,6 @@ as the others say join them. With w the ways to fail and their evidence E_w,
 
 where the prevalence p is that of the log (EM, shrunk to a usual one). Where many of the cells that
 move are refuted, the whole array does what the reference never saw: nobody is blamed for it.
-
-Not detected: an object that lies still (its cells hold a load).
 """
 
 from __future__ import annotations
@@ -133,9 +131,12 @@ class Model:
         found: Array = evidence * np.where(evidence > 0, _CERTAIN / np.maximum(_CERTAIN, most), 1)
         return found
 
-    def log_of_record(self, record: Record) -> Log:
-        """Return a record as symbols."""
-        return Log(record, self.symbols, self.present, self.living)
+    def log_of_record(self, record: Record, explained: Mask | None = None) -> Log:
+        """Return a record as symbols, without the ``explained`` cells (bool ``[D]``)."""
+        delivers = self.present
+        if explained is not None:
+            delivers = delivers & ~explained
+        return Log(record, self.symbols, delivers, self.living)
 
     def observed(self, log: Log, known: Mask) -> Observed:
         """Return what the ``known`` cells say of a log."""
@@ -145,9 +146,10 @@ class Model:
         """Judge a log, recordings ``[T, D]``."""
         return self.judge_record(record_of(recordings, self.length))
 
-    def judge_record(self, record: Record) -> Judgement:
-        """Judge a record, with pieces of this model's length."""
-        log = self.log_of_record(record)
+    def judge_record(self, record: Record, explained: Mask | None = None) -> Judgement:
+        """Judge a record, with pieces of this model's length; ``explained`` cells (bool ``[D]``;
+        None: none) are left out of it."""
+        log = self.log_of_record(record, explained)
         observed = self._by_trusted(log, np.zeros_like(log.far))
         failing = self.lines.failing(observed, self.moving(log))
         if failing.cells.any():
@@ -176,19 +178,22 @@ class Model:
         found: Mask = log.far & self.living & ~((log.run >= HELD) & (log.load[-1] > NOTHING))
         return found
 
+    def evidence_of_any(self, observed: Observed, units: Units) -> Array:
+        """Return the evidence ``[D]`` of any of the ways that tell who is trusted."""
+        deciding = [i for i, way in enumerate(WAYS) if way.decides]
+        ways = [WAYS[i] for i in deciding]
+        each = np.stack([way.evidence(observed, units) for way in ways])
+        return _of_any(self._certain(each, units, deciding), ways)
+
     def _by_trusted(self, log: Log, out: Mask) -> Observed:
         """Return what those say of a log who are trusted to predict the others; those that are
         ``out`` (bool ``[D]``) are not."""
-        deciding = [i for i, way in enumerate(WAYS) if way.decides]
-        ways = [WAYS[i] for i in deciding]
         holds = (log.run >= HELD) & (log.load[-1] > NOTHING)
         stays = ~(log.received & self.living) | out
         observed = self.observed(log, self.moving(log) & ~out)
         for _ in range(_ROUNDS):
             known = observed.known
-            units = Units.of(observed, self.odd)
-            each = np.stack([way.evidence(observed, units) for way in ways])
-            evidence = _of_any(self._certain(each, units, deciding), ways)
+            evidence = self.evidence_of_any(observed, Units.of(observed, self.odd))
             suspect = known & (evidence > _SUSPECT)
             if suspect.any():
                 observed = self.observed(log, known & ~self._worst(suspect, known, evidence))

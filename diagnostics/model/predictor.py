@@ -15,6 +15,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
+from scipy.special import expit
 
 from diagnostics.layout import SensorLayout
 from diagnostics.model.conditional_mean import ConditionalMean, loaded
@@ -192,6 +193,12 @@ class Predictor:
     def _rings(self) -> list[csr_array]:
         """Which cells lie around each one, sparse ``[D, D]`` for each ring."""
         return [_matrix(cells) for cells in self.around]
+
+    @property
+    def rests(self) -> Array:
+        """Return the share of the pieces of the reference in which each cell rests, ``[D]``."""
+        found: Array = expit(-self.usual[:, 0])
+        return found
 
     def on_pad(self, values: Array) -> Array:
         """Return the sum of values ``[..., D]`` over the pad of each cell, ``[..., D]``."""

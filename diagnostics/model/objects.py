@@ -1,0 +1,302 @@
+"""Objects that lie still: their cells hold a load and look stuck, and are no faults.
+
+A cell holds what its load never falls below from some piece on; contacts add to it. Neighbouring
+cells that do are one object, or independent faults; the log odds of an object are
+
+    log P(object here)
+        + sum over its cells i  of  log P(v_i | object, cells before i, all others at rest)
+                                    - log (P(stuck at v_i) + P(healthy without an object))
+        + sum over the cells beside it that rest  of  log P(rest | object)
+
+P(v | object) is what the predictor says of one piece in which only the cells before i are loaded,
+or an object of any shape, with loads as usual as those of the reference. On an object a cell moves
+with the others as before: the readings less v are judged, too. Cells of an object are neither
+faulty nor tested.
+
+No object holds a cell at full scale, nor takes the noise that it had at rest; no wire whose cells
+read the same is one, nor what is less than its pad shares.
+
+Not detected: objects on fewer than three cells; objects that explain no faulty cell; those of whose
+cells the last contact may still go on.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import expit
+
+from diagnostics.decision.line_cover import PROVEN
+from diagnostics.decision.static_load import StaticLoad
+from diagnostics.layout import SensorLayout
+from diagnostics.model.judge import HELD, Judgement, Model
+from diagnostics.model.observed import Log
+from diagnostics.model.record import Array, Cells, Mask, Record
+from diagnostics.model.symbols import AT_REST, CONSTANT, root_load
+from diagnostics.preprocessing.levels import ANYWHERE, EXPECTED
+
+_FEWEST = 3  # cells of an object
+_ROUNDS = 3
+_EXPECTED_OBJECTS = 0.1  # prior probability of an object in a log
+# how unlike the contacts of the reference the shape of an object is, and how likely
+_SHAPES = ((0.05, 0.7), (1.0, 0.3))
+_BESIDE = 0.3  # probability that such an object loads the cell beside a loaded one
+_SHIELDED = 0.05  # share of the cells of an object that no contact reaches
+_FLOOR = 0.2  # quantile of what a cell holds at most: contacts add to it
+_NEARLY_ALL = 0.95  # of the pieces
+_NOISY = 0.5  # P(constant at rest) of a cell with noise, less
+_BLAMED = 0.5
+
+Floats = NDArray[np.float64]
+
+
+def judged_with_objects(
+    model: Model, record: Record, layout: SensorLayout
+) -> tuple[Judgement, list[StaticLoad]]:
+    """Return the judgement of a record without the cells of the objects that lie still, and
+    these."""
+    found: list[StaticLoad] = []
+    judgement = model.judge_record(record)
+    for _ in range(_ROUNDS):
+        more = find_objects(model, judgement, layout, found)
+        if _cells_of(more, layout).sum() <= _cells_of(found, layout).sum():
+            break
+        found = more
+        judgement = model.judge_record(record, _cells_of(found, layout))
+    return judgement, found
+
+
+def _cells_of(objects: Sequence[StaticLoad], layout: SensorLayout) -> Mask:
+    return _mask([cell for one in objects for cell in one.cells], layout.n_cells)
+
+
+def _mask(cells: Sequence[int] | Cells, n: int) -> Mask:
+    on = np.zeros(n, bool)
+    on[list(cells)] = True
+    return on
+
+
+def find_objects(
+    model: Model, judgement: Judgement, layout: SensorLayout, known: Sequence[StaticLoad] = ()
+) -> list[StaticLoad]:
+    """Return the objects in a judged log; ``known``: those whose cells were left out of it."""
+    log = judgement.observed.log
+    blamed = (judgement.probability > _BLAMED) | _cells_of(known, layout)
+    held = HeldLoads.of(log, model)
+    holds = (held.load > 0) & ~_of_wires(held.load, blamed, layout, log.symbols.tolerance)
+    near = blamed
+    if known:
+        near = layout.with_neighbours(blamed)
+    number = layout.connected(holds)
+    every = [number == i for i in range(1, number.max() + 1)]
+    groups = [group for group in every if group.sum() >= _FEWEST and (group & near).any()]
+    if not groups:
+        return []
+    chain = _Chain.of(model, judgement, layout, held, holds)
+    found = []
+    for group in groups:
+        elsewhere = blamed & ~group
+        stuck = max((elsewhere & holds).sum(), ANYWHERE * elsewhere.sum()) / model.present.sum()
+        cells, odds = chain.most_likely(group, max(EXPECTED * ANYWHERE, float(stuck)))
+        if odds > PROVEN and len(cells) >= _FEWEST and near[cells].any():
+            since = int(log.record.begins[int(np.median(held.since[cells]))])
+            found.append(StaticLoad.on(cells, float(expit(odds)), since, layout))
+    return found
+
+
+def _of_wires(load: Array, blamed: Mask, layout: SensorLayout, tolerance: float) -> Mask:
+    """Return the ``blamed`` cells that hold what most cells on one of their wires do, bool
+    ``[D]``."""
+    found = np.zeros(len(load), bool)
+    for line in layout.lines:
+        cells = layout.cells_on(line)
+        held = cells[blamed[cells] & (load[cells] > 0)]
+        if len(held):
+            same = held[np.abs(load[held] - np.median(load[held])) <= tolerance]
+            if len(same) > max(2, len(cells) / 2):
+                found[same] = True
+    return found
+
+
+@dataclass(frozen=True)
+class HeldLoads:
+    """What cells hold to the end of a log, ``[D]`` each.
+
+    Attributes:
+        load: reading above rest; 0: none.
+        since: int, first piece.
+    """
+
+    load: Array
+    since: Cells
+
+    @classmethod
+    def of(cls, log: Log, model: Model) -> HeldLoads:
+        """Return what the cells of a log hold since before the last recording began."""
+        rest = log.symbols.rest
+        record = log.record
+        n = len(record)
+        last = int(np.argmax(record.recording == record.recording[-1]))
+        if last == 0:
+            last = n - HELD
+        received = model.present & record.received.any(axis=0)
+        lowest = np.minimum(_FLOOR, model.predictor.rests / 2)
+        since = _since((log.above > rest.near) & received)
+        load = np.zeros(len(received), np.float32)
+        for cell in np.flatnonzero(since < last).tolist():
+            begin = (since[cell] + n) // 2  # a contact may have gone before
+            above = log.above[begin:, cell]
+            shared = record.mean[begin:, cell] - rest.level[cell] - above
+            least = abs(np.median(shared)) + rest.near[cell]
+            floor = np.quantile(above, lowest[cell])
+            if floor > least and np.median(log.level[begin:, cell]) < log.symbols.top:
+                load[cell] = floor
+        since = _since((log.above > load / 2) & (load > 0))
+        return cls(np.where(since < last, load, 0), since)
+
+
+def _since(on: Mask) -> Cells:
+    """Return the likeliest piece of each cell from which on nearly all are ``on`` (bool ``[n, D]``)
+    and before which half of them are, int ``[D]``; n: none."""
+    each = np.where(on, np.log(2 * _NEARLY_ALL), np.log(2 - 2 * _NEARLY_ALL))
+    likely = np.flip(np.cumsum(np.flip(each, 0), 0), 0)
+    found: Cells = np.where(likely.max(axis=0) > 0, likely.argmax(axis=0), len(on))
+    return found
+
+
+@dataclass(frozen=True)
+class _Chain:
+    """Compares an object with faults, cell by cell.
+
+    Attributes:
+        model: of the array; layout: of it.
+        load: root load that each cell holds, ``[D]``; 0: none.
+        level: int ``[3, D]``, levels that it may have.
+        others: bool ``[D]``, trusted cells that hold none.
+        healthy: ``[D]``, log P(log | healthy, no object) - log P(log | healthy, object).
+        dead: ``[D]``, evidence of any fault in the log less what the cells hold.
+    """
+
+    model: Model
+    layout: SensorLayout
+    load: Array
+    level: Cells
+    others: Mask
+    healthy: Array
+    dead: Array
+
+    @classmethod
+    def of(
+        cls,
+        model: Model,
+        judgement: Judgement,
+        layout: SensorLayout,
+        held: HeldLoads,
+        holds: Mask,
+    ) -> _Chain:
+        """Return the comparison of a judged log, with the cells that hold a load, bool ``[D]``."""
+        log = judgement.observed.log
+        record = log.record
+        others = judgement.known & ~holds
+        above = np.where(holds, held.load, 0).astype(np.float32)
+        during = np.arange(len(record))[:, None] >= held.since
+        lift = np.where(during, above, 0)
+        still = during & (np.abs(log.above - lift) <= 2 * log.symbols.tolerance)
+        noise = _constant_at_rest(model) < np.log(_NOISY)
+        without = model.observed(model.log_of_record(_less(log, lift, still & ~noise)), others)
+        units = judgement.units
+        # no contact may reach what lies under it, but it takes no noise away
+        lost = np.where(still & noise & (log.flat == CONSTANT), -_constant_at_rest(model), 0)
+        most = units.of_units(lost).sum(axis=0) - np.log(_SHIELDED)
+        dead = model.evidence_of_any(without, units)
+        healthy = dead - model.evidence_of_any(model.observed(log, others), units)
+        dead = np.where((still | ~during).all(axis=0), np.minimum(dead, most), dead)
+        rest = log.symbols.rest
+        doubt = rest.near / 2
+        each = [root_load(above + shift, rest) for shift in (0.0, -doubt, doubt)]
+        level = np.searchsorted(log.symbols.edges, np.stack(each), "right")
+        return cls(model, layout, each[0], level, others, healthy, dead)
+
+    def width(self) -> Floats:
+        """Return P(level | stuck at any value), ``[D]``."""
+        edges = np.append(self.model.symbols.edges.astype(np.float64), 1.0) ** 2
+        of_level = np.append(np.diff(edges), [1.0, 1.0])
+        found: Floats = of_level[np.maximum(self.level[0], 1) - 1]
+        return found
+
+    def with_object(self, chosen: Sequence[int], odd: float) -> tuple[Floats, Floats]:
+        """Return log P(load) and log P(rest), ``[D]`` each, with an object on the ``chosen`` cells
+        that has any shape with probability ``odd``."""
+        on = _mask(chosen, len(self.load))
+        any_shape = np.where(self.model.living, odd, 1.0)
+        levels = np.ones((len(on), self.model.symbols.n), np.float32)
+        if odd < 1:
+            load = np.where(on, self.load, 0)[None]
+            nobody = np.zeros_like(load)
+            levels = self.model.predictor(load, nobody, np.ones(1, bool), self.others | on)[0]
+        likely = levels[np.arange(len(on)), self.level].max(axis=0)
+        log_load = np.log((1 - any_shape) * likely + any_shape * _BESIDE * self.any_load())
+        log_rest = np.log((1 - any_shape) * levels[:, 0] + any_shape * (1 - _BESIDE))
+        return log_load, log_rest
+
+    def any_load(self) -> Floats:
+        """Return P(level | load of an object), ``[D]``: that of a contact, or any."""
+        found: Floats = (1 / len(self.model.symbols.edges) + self.width()) / 2
+        return found
+
+    def most_likely(self, group: Mask, share: float) -> tuple[Cells, float]:
+        """Return the cells of a group that one object explains best, and its log odds.
+
+        Args:
+            group: bool ``[D]``, neighbouring cells that hold a load.
+            share: of the cells that are stuck.
+        """
+        own = -np.logaddexp(np.log(share * self.width()) + self.dead, self.healthy)
+        each = []
+        for odd, prior in _SHAPES:
+            cells, odds = self._best(group, own, odd)
+            each.append((odds + float(np.log(prior)), cells))
+        odds, cells = max(each, key=lambda one: one[0])
+        return cells, odds
+
+    def _best(self, group: Mask, own: Floats, odd: float) -> tuple[Cells, float]:
+        first = own + np.log(self.any_load())
+        chosen = [int(np.where(group, first, -np.inf).argmax())]
+        expected = np.log(_EXPECTED_OBJECTS / self.model.present.sum())
+        sums = [float(expected + first[chosen[0]])]
+        while True:
+            on = _mask(chosen, len(group))
+            beside = self.layout.with_neighbours(on) & ~on & group
+            if not beside.any():
+                break
+            log_load, _ = self.with_object(chosen, odd)
+            gain = np.where(beside, log_load + own, -np.inf)
+            # as many again as are known: few predictions, and what joins together gives no support
+            more = np.argsort(-gain, kind="stable")[: min(len(chosen), int(beside.sum()))]
+            chosen += more.tolist()
+            sums += (sums[-1] + np.cumsum(gain[more])).tolist()
+        best = int(np.argmax(sums))
+        chosen = chosen[: best + 1]
+        on = _mask(chosen, len(group))
+        around = self.layout.with_neighbours(on) & ~on & self.others
+        _, log_rest = self.with_object(chosen, odd)
+        return np.array(sorted(chosen)), sums[best] + float(log_rest[around].sum())
+
+
+def _constant_at_rest(model: Model) -> Array:
+    """Return log P(constant | at rest and constant a piece ago), ``[1, D]``."""
+    constant = np.full((1, len(model.present)), CONSTANT, np.int8)
+    return model.flatness.of_chain(np.full(constant.shape, AT_REST), constant, constant)
+
+
+def _less(log: Log, lift: Array, rests: Mask) -> Record:
+    """Return the record of a log with readings that are lower by ``lift``, ``[n, D]``; in pieces in
+    which a cell ``rests``, bool ``[n, D]``, with those at rest."""
+    record = log.record
+    mean = record.mean - np.where(rests, log.above, lift)
+    low = np.where(rests, mean, record.low - lift)
+    high = np.where(rests, mean, record.high - lift)
+    return replace(record, low=low, high=high, mean=mean)

@@ -205,10 +205,12 @@ class Reading(CalibratedArray):
     @contextmanager
     def _bar(self) -> Iterator[Callable[[int], None]]:
         """Show the frames that are read; it is called with the number of more frames."""
+        if self.quiet or not sys.stderr.isatty():
+            yield lambda frames: None
+            return
         from tqdm import tqdm
 
-        hide = True if self.quiet else None
-        with tqdm(unit="frame", desc="reading", disable=hide, leave=False, unit_scale=True) as bar:
+        with tqdm(unit="frame", desc="reading", leave=False, unit_scale=True) as bar:
 
             def advance(frames: int) -> None:
                 bar.update(frames)

@@ -17,9 +17,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
 
 _PROJECTIONS = 8
 _LOOKED_UP = 8  # frames of a recording
@@ -63,6 +60,9 @@ def find_copies(
                 links.append((i, j))
     if not links:
         return own
+    from scipy.sparse import coo_array  # slow to import, and rarely needed
+    from scipy.sparse.csgraph import connected_components
+
     ones = np.ones(len(links))
     graph = coo_array((ones, np.array(links).T), shape=(n, n))
     _, group = connected_components(graph, directed=False)
@@ -149,6 +149,8 @@ def _identical(loads: _Loads, kept: Sequence[int]) -> list[tuple[int, int]]:
 
 def _pairs(loads: _Loads, kept: Sequence[int]) -> list[tuple[int, int, int]]:
     """Return (i, j, shift) where a frame t of recording i reads nearly as frame t + shift of j."""
+    from scipy.spatial import cKDTree  # slow to import, and not needed to read recordings
+
     width = loads.of(kept[0]).shape[1]
     rng = np.random.default_rng(0)
     directions = rng.choice([-1.0, 1.0], (width, _PROJECTIONS)) / np.sqrt(width)

@@ -119,6 +119,19 @@ def test_lerobot_episodes_are_recordings_and_their_tasks_are_classes(tmp_path, v
     assert recordings.names[3].endswith("episode 3")
 
 
+def test_info_of_a_lerobot_set_waits_for_no_package_that_it_does_not_need(tmp_path):
+    path = lerobot(tmp_path / "set", {"observation.tactile.left": episodes()})
+    code = (
+        "import sys; from adaptfault.cli import main; main(sys.argv[1:]);"
+        "sys.exit(str({'pandas', 'scipy', 'sklearn', 'torch', 'tqdm'} & sys.modules.keys()))"
+    )
+    told = subprocess.run(
+        [sys.executable, "-c", code, "info", str(path)], capture_output=True, text=True, check=False
+    )
+    assert "4 of" in told.stdout
+    assert told.stderr.splitlines()[-1] == "set()"
+
+
 def test_lerobot_pads_of_different_shapes_are_one_layout(tmp_path):
     thumb = episodes(grid=(3, 3))
     palm = episodes(grid=(2, 5))

@@ -154,7 +154,7 @@ def _tasks(path: Path) -> dict[str, str]:
             held = [json.loads(line) for line in lines.read_text("utf-8").splitlines() if line]
             return {str(int(one[_TASK])): str(one["task"]) for one in held}
         if table.is_file():
-            read = imported("pyarrow.parquet", table).read_table(table).to_pydict()
+            read = imported("pyarrow.parquet", table).ParquetFile(table).read().to_pydict()
             names = next(column for name, column in read.items() if name != _TASK)
             numbers = [str(int(number)) for number in read[_TASK]]
             return dict(zip(numbers, map(str, names), strict=True))

@@ -29,6 +29,9 @@ SUFFIXES = (".parquet", ".pq")
 
 _DAMAGED = "is no Parquet file, or is cut off; copy it again"
 
+# Arrow's names of numbers where numpy has another; its own conversion imports pandas
+_NUMBERS = {"halffloat": "float16", "float": "float32", "double": "float64"}
+
 
 @contextmanager
 def opened(path: Path, names: Sequence[str] | None = None) -> Iterator[Contents]:
@@ -174,7 +177,7 @@ def _dtype(path: Path, kind: Any) -> np.dtype[Any] | None:
     texts."""
     types = imported("pyarrow.types", path)
     if types.is_integer(kind) or types.is_floating(kind):
-        number: np.dtype[Any] = np.dtype(kind.to_pandas_dtype())
+        number: np.dtype[Any] = np.dtype(_NUMBERS.get(str(kind), str(kind)))
         return number
     if types.is_decimal(kind):
         return np.dtype(np.float64)
@@ -225,7 +228,8 @@ def _array(path: Path, column: Any, about: _Column, first: int) -> NDArray[Any]:
         elif isinstance(kind, pa.BaseExtensionType):
             column = column.storage
         elif pa.types.is_nested(kind):
-            lengths = compute.list_value_length(column).fill_null(-1).to_numpy()
+            counts = compute.list_value_length(column)
+            lengths = _numpy(pa, counts.fill_null(-1) if counts.null_count else counts)
             expected = math.prod(sizes) if order else sizes[0]
             wrong = np.flatnonzero(lengths != expected)
             if len(wrong):
@@ -255,5 +259,8 @@ def _numpy(pa: Any, column: Any) -> NDArray[Any]:
         column = whole.view(pa.timestamp(kind.unit))
     if pa.types.is_decimal(kind):
         column = column.cast(pa.float64())
+    plain = pa.types.is_integer(kind) or pa.types.is_floating(kind)
+    if plain and not column.null_count:
+        return np.from_dlpack(column)  # the other way imports pandas
     values: NDArray[Any] = column.to_numpy(zero_copy_only=False)
     return values

@@ -131,12 +131,9 @@ class Model:
         found: Array = evidence * np.where(evidence > 0, _CERTAIN / np.maximum(_CERTAIN, most), 1)
         return found
 
-    def log_of_record(self, record: Record, explained: Mask | None = None) -> Log:
-        """Return a record as symbols, without the ``explained`` cells (bool ``[D]``)."""
-        delivers = self.present
-        if explained is not None:
-            delivers = delivers & ~explained
-        return Log(record, self.symbols, delivers, self.living)
+    def log_of_record(self, record: Record) -> Log:
+        """Return a record as symbols."""
+        return Log(record, self.symbols, self.present, self.living)
 
     def observed(self, log: Log, known: Mask) -> Observed:
         """Return what the ``known`` cells say of a log."""
@@ -148,8 +145,11 @@ class Model:
 
     def judge_record(self, record: Record, explained: Mask | None = None) -> Judgement:
         """Judge a record, with pieces of this model's length; ``explained`` cells (bool ``[D]``;
-        None: none) are left out of it."""
-        log = self.log_of_record(record, explained)
+        None: none) tell what their pad shares, no more."""
+        log = self.log_of_record(record)
+        if explained is not None:
+            log.received &= ~explained
+            log.far &= ~explained
         observed = self._by_trusted(log, np.zeros_like(log.far))
         failing = self.lines.failing(observed, self.moving(log))
         if failing.cells.any():

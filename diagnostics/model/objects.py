@@ -14,7 +14,7 @@ with the others as before: the readings less v are judged, too. Cells of an obje
 faulty nor tested.
 
 No object holds a cell at full scale, nor takes the noise that it had at rest; no wire whose cells
-read the same is one, nor what is less than its pad shares.
+read the same is one, nor what a cell may share with its pad; some cells of the pad rest beside it.
 
 Not detected: objects on fewer than three cells; objects that explain no faulty cell; those of whose
 cells the last contact may still go on.
@@ -60,12 +60,15 @@ def judged_with_objects(
     these."""
     found: list[StaticLoad] = []
     judgement = model.judge_record(record)
+    log = model.log_of_record(record)
+    held = HeldLoads.of(log, model)
     for _ in range(_ROUNDS):
-        more = find_objects(model, judgement, layout, found)
-        if _cells_of(more, layout).sum() <= _cells_of(found, layout).sum():
+        more = find_objects(model, judgement, log, held, layout, found)
+        under = _cells_of(more, layout)
+        if under.sum() <= _cells_of(found, layout).sum():
             break
         found = more
-        judgement = model.judge_record(record, _cells_of(found, layout))
+        judgement = model.judge_record(held.without(log, under, model), under)
     return judgement, found
 
 
@@ -80,22 +83,35 @@ def _mask(cells: Sequence[int] | Cells, n: int) -> Mask:
 
 
 def find_objects(
-    model: Model, judgement: Judgement, layout: SensorLayout, known: Sequence[StaticLoad] = ()
+    model: Model,
+    judgement: Judgement,
+    log: Log,
+    held: HeldLoads,
+    layout: SensorLayout,
+    known: Sequence[StaticLoad] = (),
 ) -> list[StaticLoad]:
-    """Return the objects in a judged log; ``known``: those whose cells were left out of it."""
-    log = judgement.observed.log
+    """Return the objects in a log.
+
+    Args:
+        model: of the array.
+        judgement: of the log without the cells of ``known`` objects.
+        log: all of it.
+        held: what its cells hold.
+        layout: of the array.
+        known: objects found before.
+    """
     blamed = (judgement.probability > _BLAMED) | _cells_of(known, layout)
-    held = HeldLoads.of(log, model)
     holds = (held.load > 0) & ~_of_wires(held.load, blamed, layout, log.symbols.tolerance)
     near = blamed
     if known:
         near = layout.with_neighbours(blamed)
-    number = layout.connected(holds)
+    resting = model.predictor.on_pad((judgement.known & ~holds).astype(np.float32))
+    number = layout.connected(holds & (resting > 0))
     every = [number == i for i in range(1, number.max() + 1)]
     groups = [group for group in every if group.sum() >= _FEWEST and (group & near).any()]
     if not groups:
         return []
-    chain = _Chain.of(model, judgement, layout, held, holds)
+    chain = _Chain.of(model, judgement, log, held, layout, holds)
     found = []
     for group in groups:
         elsewhere = blamed & ~group
@@ -149,13 +165,38 @@ class HeldLoads:
         for cell in np.flatnonzero(since < last).tolist():
             begin = (since[cell] + n) // 2  # a contact may have gone before
             above = log.above[begin:, cell]
-            shared = record.mean[begin:, cell] - rest.level[cell] - above
-            least = abs(np.median(shared)) + rest.near[cell]
             floor = np.quantile(above, lowest[cell])
+            floor = np.median(above[above <= floor + 2 * rest.near[cell]])
+            shared = np.median(record.mean[begin:, cell] - rest.level[cell] - above)
+            # what it may share with its pad beside what it is known to
+            more = shared * (1 / max(rest.share[cell], _FLOOR) - 1)
+            least = rest.near[cell] + max(more, -shared)
             if floor > least and np.median(log.level[begin:, cell]) < log.symbols.top:
                 load[cell] = floor
         since = _since((log.above > load / 2) & (load > 0))
         return cls(np.where(since < last, load, 0), since)
+
+    def during(self, log: Log) -> Mask:
+        """Return the pieces in which each cell holds its load, bool ``[n, D]``."""
+        found: Mask = np.greater_equal(np.arange(len(log.record))[:, None], self.since)
+        return found
+
+    def still(self, log: Log) -> Mask:
+        """Return the pieces in which it reads no more, bool ``[n, D]``."""
+        same = np.abs(log.above - self.load) <= 2 * log.symbols.tolerance
+        found: Mask = self.during(log) & same
+        return found
+
+    def without(self, log: Log, cells: Mask, model: Model) -> Record:
+        """Return the record without the loads of some cells, bool ``[D]``. A load may come with
+        noise: those that have none at rest rest where they read no more."""
+        lift = np.where(self.during(log) & cells, self.load, 0)
+        rests = self.still(log) & cells & (_constant_at_rest(model) >= np.log(_NOISY))
+        record = log.record
+        mean = record.mean - np.where(rests, log.above, lift)
+        low = np.where(rests, mean, record.low - lift)
+        high = np.where(rests, mean, record.high - lift)
+        return replace(record, low=low, high=high, mean=mean)
 
 
 def _since(on: Mask) -> Cells:
@@ -176,7 +217,8 @@ class _Chain:
         load: root load that each cell holds, ``[D]``; 0: none.
         level: int ``[3, D]``, levels that it may have.
         others: bool ``[D]``, trusted cells that hold none.
-        healthy: ``[D]``, log P(log | healthy, no object) - log P(log | healthy, object).
+        healthy: ``[D]``, log P(log | healthy, no object) - log P(log | healthy, object), as far as
+            a fault explains it.
         dead: ``[D]``, evidence of any fault in the log less what the cells hold.
     """
 
@@ -193,30 +235,31 @@ class _Chain:
         cls,
         model: Model,
         judgement: Judgement,
-        layout: SensorLayout,
+        log: Log,
         held: HeldLoads,
+        layout: SensorLayout,
         holds: Mask,
     ) -> _Chain:
-        """Return the comparison of a judged log, with the cells that hold a load, bool ``[D]``."""
-        log = judgement.observed.log
-        record = log.record
+        """Return the comparison for the cells that may hold a load, bool ``[D]``; other arguments
+        as for :func:`find_objects`."""
         others = judgement.known & ~holds
-        above = np.where(holds, held.load, 0).astype(np.float32)
-        during = np.arange(len(record))[:, None] >= held.since
-        lift = np.where(during, above, 0)
-        still = during & (np.abs(log.above - lift) <= 2 * log.symbols.tolerance)
+        still = held.still(log) & holds
         noise = _constant_at_rest(model) < np.log(_NOISY)
-        without = model.observed(model.log_of_record(_less(log, lift, still & ~noise)), others)
+        without = model.observed(model.log_of_record(held.without(log, holds, model)), others)
         units = judgement.units
         # no contact may reach what lies under it, but it takes no noise away
         lost = np.where(still & noise & (log.flat == CONSTANT), -_constant_at_rest(model), 0)
         most = units.of_units(lost).sum(axis=0) - np.log(_SHIELDED)
         dead = model.evidence_of_any(without, units)
-        healthy = dead - model.evidence_of_any(model.observed(log, others), units)
-        dead = np.where((still | ~during).all(axis=0), np.minimum(dead, most), dead)
+        blamed = model.evidence_of_any(model.observed(log, others), units)
+        healthy = np.maximum(dead, 0) - np.maximum(blamed, 0)
+        shielded = (still | ~held.during(log)).all(axis=0)
+        dead = np.where(shielded, np.minimum(dead, most), dead)
         rest = log.symbols.rest
         doubt = rest.near / 2
-        each = [root_load(above + shift, rest) for shift in (0.0, -doubt, doubt)]
+        each = [
+            root_load(np.where(holds, held.load + shift, 0), rest) for shift in (0.0, -doubt, doubt)
+        ]
         level = np.searchsorted(log.symbols.edges, np.stack(each), "right")
         return cls(model, layout, each[0], level, others, healthy, dead)
 
@@ -290,13 +333,3 @@ def _constant_at_rest(model: Model) -> Array:
     """Return log P(constant | at rest and constant a piece ago), ``[1, D]``."""
     constant = np.full((1, len(model.present)), CONSTANT, np.int8)
     return model.flatness.of_chain(np.full(constant.shape, AT_REST), constant, constant)
-
-
-def _less(log: Log, lift: Array, rests: Mask) -> Record:
-    """Return the record of a log with readings that are lower by ``lift``, ``[n, D]``; in pieces in
-    which a cell ``rests``, bool ``[n, D]``, with those at rest."""
-    record = log.record
-    mean = record.mean - np.where(rests, log.above, lift)
-    low = np.where(rests, mean, record.low - lift)
-    high = np.where(rests, mean, record.high - lift)
-    return replace(record, low=low, high=high, mean=mean)

@@ -1,23 +1,23 @@
 """Objects that lie still: their cells hold a load and look stuck, and are no faults.
 
-A cell holds what its load never falls below from some piece on; contacts add to it. Neighbouring
+A cell holds what its load hardly falls below from some piece on; contacts add to it. Neighbouring
 cells that do are one object, or independent faults; the log odds of an object are
 
     log P(object here)
-        + sum over its cells i  of  log P(v_i | object, cells before i, all others at rest)
-                                    - log (P(stuck at v_i) + P(healthy without an object))
+        + sum over its cells i  of  log P(loaded, v_i | object) - log (P(stuck at v_i) d_i + h_i)
         + sum over the cells beside it that rest  of  log P(rest | object)
 
-P(v | object) is what the predictor says of one piece in which only the cells before i are loaded,
-or an object of any shape, with loads as usual as those of the reference. On an object a cell moves
-with the others as before: the readings less v are judged, too. Cells of an object are neither
-faulty nor tested.
+v is what a cell holds. On an object it moves with the others as before: d is the likelihood ratio
+of any fault to none in the log without v. h is the same of a healthy cell without an object to one
+with it. An object may have any shape: it loads the cell beside a loaded one with some probability,
+half of the time as the contacts of the reference do. Cells of an object are neither faulty nor
+tested; without what they hold they tell what their pad shares.
 
 No object holds a cell at full scale, nor takes the noise that it had at rest; no wire whose cells
 read the same is one, nor what a cell may share with its pad; some cells of the pad rest beside it.
 
 Not detected: objects on fewer than three cells; objects that explain no faulty cell; those of whose
-cells the last contact may still go on.
+cells the last contact may still go on; one on a whole pad.
 """
 
 from __future__ import annotations
@@ -41,9 +41,7 @@ from diagnostics.preprocessing.levels import ANYWHERE, EXPECTED
 _FEWEST = 3  # cells of an object
 _ROUNDS = 3
 _EXPECTED_OBJECTS = 0.1  # prior probability of an object in a log
-# how unlike the contacts of the reference the shape of an object is, and how likely
-_SHAPES = ((0.05, 0.7), (1.0, 0.3))
-_BESIDE = 0.3  # probability that such an object loads the cell beside a loaded one
+_BESIDE = 0.3  # probability that an object loads the cell beside a loaded one
 _SHIELDED = 0.05  # share of the cells of an object that no contact reaches
 _FLOOR = 0.2  # quantile of what a cell holds at most: contacts add to it
 _NEARLY_ALL = 0.95  # of the pieces
@@ -117,7 +115,7 @@ def find_objects(
         elsewhere = blamed & ~group
         stuck = max((elsewhere & holds).sum(), ANYWHERE * elsewhere.sum()) / model.present.sum()
         cells, odds = chain.most_likely(group, max(EXPECTED * ANYWHERE, float(stuck)))
-        if odds > PROVEN and len(cells) >= _FEWEST and near[cells].any():
+        if odds > PROVEN and near[cells].any():
             since = int(log.record.begins[int(np.median(held.since[cells]))])
             found.append(StaticLoad.on(cells, float(expit(odds)), since, layout))
     return found
@@ -213,19 +211,20 @@ class _Chain:
     """Compares an object with faults, cell by cell.
 
     Attributes:
-        model: of the array; layout: of it.
-        load: root load that each cell holds, ``[D]``; 0: none.
-        level: int ``[3, D]``, levels that it may have.
+        layout: of the array.
+        present: number of its cells.
+        width: ``[D]``, P(the load that each cell holds | stuck), at any value.
+        usual: ``[D]``, P(it | object): half of them are any, half as those of the reference.
         others: bool ``[D]``, trusted cells that hold none.
         healthy: ``[D]``, log P(log | healthy, no object) - log P(log | healthy, object), as far as
             a fault explains it.
         dead: ``[D]``, evidence of any fault in the log less what the cells hold.
     """
 
-    model: Model
     layout: SensorLayout
-    load: Array
-    level: Cells
+    present: int
+    width: Array
+    usual: Array
     others: Mask
     healthy: Array
     dead: Array
@@ -255,40 +254,13 @@ class _Chain:
         healthy = np.maximum(dead, 0) - np.maximum(blamed, 0)
         shielded = (still | ~held.during(log)).all(axis=0)
         dead = np.where(shielded, np.minimum(dead, most), dead)
-        rest = log.symbols.rest
-        doubt = rest.near / 2
-        each = [
-            root_load(np.where(holds, held.load + shift, 0), rest) for shift in (0.0, -doubt, doubt)
-        ]
-        level = np.searchsorted(log.symbols.edges, np.stack(each), "right")
-        return cls(model, layout, each[0], level, others, healthy, dead)
-
-    def width(self) -> Floats:
-        """Return P(level | stuck at any value), ``[D]``."""
-        edges = np.append(self.model.symbols.edges.astype(np.float64), 1.0) ** 2
-        of_level = np.append(np.diff(edges), [1.0, 1.0])
-        found: Floats = of_level[np.maximum(self.level[0], 1) - 1]
-        return found
-
-    def with_object(self, chosen: Sequence[int], odd: float) -> tuple[Floats, Floats]:
-        """Return log P(load) and log P(rest), ``[D]`` each, with an object on the ``chosen`` cells
-        that has any shape with probability ``odd``."""
-        on = _mask(chosen, len(self.load))
-        any_shape = np.where(self.model.living, odd, 1.0)
-        levels = np.ones((len(on), self.model.symbols.n), np.float32)
-        if odd < 1:
-            load = np.where(on, self.load, 0)[None]
-            nobody = np.zeros_like(load)
-            levels = self.model.predictor(load, nobody, np.ones(1, bool), self.others | on)[0]
-        likely = levels[np.arange(len(on)), self.level].max(axis=0)
-        log_load = np.log((1 - any_shape) * likely + any_shape * _BESIDE * self.any_load())
-        log_rest = np.log((1 - any_shape) * levels[:, 0] + any_shape * (1 - _BESIDE))
-        return log_load, log_rest
-
-    def any_load(self) -> Floats:
-        """Return P(level | load of an object), ``[D]``: that of a contact, or any."""
-        found: Floats = (1 / len(self.model.symbols.edges) + self.width()) / 2
-        return found
+        load = root_load(np.where(holds, held.load, 0), log.symbols.rest)
+        edges = np.append(log.symbols.edges, 1.0)
+        level = np.clip(np.searchsorted(edges, load, "right"), 1, len(edges) - 1) - 1
+        width = np.diff(edges**2)[level]
+        usual = ((width + 1 / (len(edges) - 1)) / 2).astype(np.float32)
+        present = int(model.present.sum())
+        return cls(layout, present, width, usual, others, healthy, dead)
 
     def most_likely(self, group: Mask, share: float) -> tuple[Cells, float]:
         """Return the cells of a group that one object explains best, and its log odds.
@@ -297,36 +269,24 @@ class _Chain:
             group: bool ``[D]``, neighbouring cells that hold a load.
             share: of the cells that are stuck.
         """
-        own = -np.logaddexp(np.log(share * self.width()) + self.dead, self.healthy)
-        each = []
-        for odd, prior in _SHAPES:
-            cells, odds = self._best(group, own, odd)
-            each.append((odds + float(np.log(prior)), cells))
-        odds, cells = max(each, key=lambda one: one[0])
-        return cells, odds
-
-    def _best(self, group: Mask, own: Floats, odd: float) -> tuple[Cells, float]:
-        first = own + np.log(self.any_load())
+        own = -np.logaddexp(np.log(share * self.width) + self.dead, self.healthy)
+        first = own + np.log(self.usual)
+        gain = first + np.log(_BESIDE)
         chosen = [int(np.where(group, first, -np.inf).argmax())]
-        expected = np.log(_EXPECTED_OBJECTS / self.model.present.sum())
-        sums = [float(expected + first[chosen[0]])]
+        on = _mask(chosen, len(group))
+        odds = [np.log(_EXPECTED_OBJECTS / self.present) + first[chosen[0]]]
         while True:
-            on = _mask(chosen, len(group))
             beside = self.layout.with_neighbours(on) & ~on & group
             if not beside.any():
                 break
-            log_load, _ = self.with_object(chosen, odd)
-            gain = np.where(beside, log_load + own, -np.inf)
-            # as many again as are known: few predictions, and what joins together gives no support
-            more = np.argsort(-gain, kind="stable")[: min(len(chosen), int(beside.sum()))]
-            chosen += more.tolist()
-            sums += (sums[-1] + np.cumsum(gain[more])).tolist()
-        best = int(np.argmax(sums))
-        chosen = chosen[: best + 1]
-        on = _mask(chosen, len(group))
+            best = int(np.where(beside, gain, -np.inf).argmax())
+            on[best] = True
+            chosen.append(best)
+            odds.append(odds[-1] + gain[best])
+        most = _FEWEST - 1 + int(np.argmax(odds[_FEWEST - 1 :]))
+        on = _mask(chosen[: most + 1], len(group))
         around = self.layout.with_neighbours(on) & ~on & self.others
-        _, log_rest = self.with_object(chosen, odd)
-        return np.array(sorted(chosen)), sums[best] + float(log_rest[around].sum())
+        return np.flatnonzero(on), float(odds[most] + np.log(1 - _BESIDE) * around.sum())
 
 
 def _constant_at_rest(model: Model) -> Array:

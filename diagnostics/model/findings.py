@@ -105,17 +105,17 @@ def findings(
         wire=np.where(on_line, failing.line, -1),
         of_wire=failing.probability,
         share=failing.share,
-        as_one=zero,
+        as_one=failing.as_one,
         typical=reading,
     )
 
 
 def shown(judgement: Judgement) -> Mask:
     """Return the cells that follow the others as a healthy one does, bool ``[D]``: they do not move
-    by themselves, and no way to fail is near."""
+    by themselves, no way to fail is near, and their line works."""
     floats = [way.kind is FaultKind.FLOATING for way in WAYS]
     follows = (judgement.evidence[floats] < -_SHOWN).all(axis=0)
-    found: Mask = follows & (judgement.evidence.max(axis=0) < _SHOWN)
+    found: Mask = follows & (judgement.evidence.max(axis=0) < _SHOWN) & ~judgement.failing.doubted
     return found
 
 
@@ -163,7 +163,7 @@ def _since(judgement: Judgement, way: NDArray[np.intp], on_line: Mask) -> NDArra
     """Return the number of the first frame of the fault of each cell, int ``[D]``; ``on_line``:
     bool ``[D]``, cells of a line that fails."""
     begins = judgement.observed.log.record.begins
-    found = np.where(on_line, begins[judgement.failing.since], 0)
+    found = np.where(on_line, judgement.failing.since, 0)
     for i, one in enumerate(WAYS):
         of_way = (way == i) & ~on_line
         if one.since is not None and of_way.any():

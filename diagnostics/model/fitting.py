@@ -14,11 +14,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from diagnostics.evidence.reference import converter_step
+from diagnostics.evidence.reference import converter_step, tolerance_of
 from diagnostics.layout import SensorLayout
 from diagnostics.model.conditional_mean import ConditionalMean, CrossFitted
+from diagnostics.model.groups import as_one_of, fit_groups
 from diagnostics.model.judge import Judgement, Model
-from diagnostics.model.lines import NO_HALF, Lines, fit_lines, odd_of
+from diagnostics.model.lines import NO_HALF, fit_lines, odd_of
+from diagnostics.model.observed import Log
 from diagnostics.model.predictor import CrossFittedNetwork, Network, Predictor
 from diagnostics.model.record import Array, Cells, Mask, Record, frames_of_piece, record_of
 from diagnostics.model.rest import fit_rest
@@ -149,16 +151,23 @@ def fit_model(
     cross_fitted = CrossFitted.of(means, reference.of_piece)
     half = reference.of_piece % _HALVES
     lines, resting = fit_lines(layout, living, cross_fitted, load, record, half)
-    held_out = _held_out(reference, symbols, examples, resting)
+    tolerance = tolerance_of([np.asarray(one, float) for one in recordings], layout)
+    as_one = as_one_of(layout, living, symbols, flat, tolerance)
+    if len(as_one.on):
+        record = record_of(recordings, length, as_one)
+        reference = replace(reference, record=record)
+    groups, chain = fit_groups(as_one, Log(record, symbols, present, living), half)
+    held_out = _held_out(reference, symbols, examples, resting, chain)
     progress(0.5)
     flatness = reference.flatness(symbols, np.ones(len(record), bool))
-    model = Model.of(symbols, flatness, predictor, length, present, living, lines)
+    model = Model.of(symbols, flatness, predictor, length, present, living, lines, groups)
     held_out.judge(model, reference.of_piece)
     model.odd = _odd(model, reference)
     model.lines = replace(model.lines, odd=_odd_lines(model, reference))
     progress(0.6)
-    model.highest, model.lines, model.reached = _highest(model, reference, held_out, rng)
+    _judge_logs(model, reference, held_out, rng)
     model.lines = replace(model.lines, resting=lines.resting, half=NO_HALF)
+    model.groups = replace(model.groups, chain=groups.chain, half=NO_HALF)
     predictor.mean = whole
     predictor.network = network
     model.flatness = flatness
@@ -181,12 +190,13 @@ def _enough(recordings: list[Array]) -> list[Array]:
 @dataclass(frozen=True)
 class _HeldOut:
     """What is fitted without each fold: conditional means, and without each half: networks and
-    tables; of how lines rest ``[halves, W, M]``."""
+    tables; how lines rest, and chains of groups."""
 
     means: Sequence[ConditionalMean]
     networks: Sequence[Network]
     tables: Sequence[Flatness]
     resting: Array
+    chain: Array
 
     def judge(self, model: Model, fold: Cells) -> None:
         """Let a model judge pieces of these folds (int ``[n]``) by what has not seen them."""
@@ -195,10 +205,15 @@ class _HeldOut:
         model.predictor.network = CrossFittedNetwork.of(self.networks, half)
         model.flatness = CrossFittedFlatness.of(self.tables, half)
         model.lines = replace(model.lines, resting=self.resting, half=half)
+        model.groups = replace(model.groups, chain=self.chain, half=half)
 
 
 def _held_out(
-    reference: _Reference, symbols: Symbols, examples: Sequence[Examples], resting: Array
+    reference: _Reference,
+    symbols: Symbols,
+    examples: Sequence[Examples],
+    resting: Array,
+    chain: Array,
 ) -> _HeldOut:
     """Return what is fitted without each fold, and without each half of them."""
     half = reference.of_piece % _HALVES
@@ -208,7 +223,7 @@ def _held_out(
         others = [of_fold for i, of_fold in enumerate(examples) if i % _HALVES != k]
         networks.append(Network.fit(*_together(others), symbols.n, _FEWER))
         tables.append(reference.flatness(symbols, half != k))
-    return _HeldOut(reference.means, networks, tables, resting)
+    return _HeldOut(reference.means, networks, tables, resting, chain)
 
 
 def _together(examples: Sequence[Examples]) -> Examples:
@@ -265,23 +280,25 @@ def _odd(model: Model, reference: _Reference) -> Array:
 
 
 def _odd_lines(model: Model, reference: _Reference) -> Array:
-    """Return in which share of its units each healthy line is odd, ``[W]``."""
+    """Return in which share of the recordings each healthy line is odd, ``[W]``."""
     log = model.log_of_record(reference.record)
     living = model.living & log.received
-    _, ratio, _ = model.lines.evidence(model.observed(log, living), living, living)
-    return odd_of(ratio)
+    found = model.lines.evidence(model.observed(log, living), living, living)
+    return odd_of(found[1])
 
 
-def _highest(
+def _judge_logs(
     model: Model, reference: _Reference, held_out: _HeldOut, rng: np.random.Generator
-) -> tuple[Array, Lines, int]:
-    """Return the evidence of each way that healthy cells reach, ``[ways, D]``, in logs that are
-    held out, with dead cells beside, the lines with theirs, and the units of the longest log."""
+) -> None:
+    """Let a model know the evidence of each way that healthy cells reach, lines and groups with
+    them, in logs that are held out, with dead cells beside."""
     cells = np.flatnonzero(model.living)
     highest = np.zeros((len(WAYS), len(model.present)))
-    of_lines = np.zeros(len(model.lines.on))
+    of_lines = np.zeros(len(model.lines.on), np.float32)
+    of_groups = np.zeros(len(model.groups.odd), np.float32)
     every = []
     longest = 1
+    pieces = 1
     for i in range(_LOGS):
         size = min(len(reference.recordings), _LENGTHS[i % len(_LENGTHS)])
         chosen = rng.choice(len(reference.recordings), size, replace=False)
@@ -292,19 +309,25 @@ def _highest(
             value = rng.uniform(0, 1) * model.symbols.rest.full
             for frames in log:
                 frames[:, cell] = value
-        record = record_of(log, model.length)
+        record = model.record_of(log)
         held_out.judge(model, reference.fold[chosen][record.recording])
         judgement = model.judge_record(record)
         evidence = judgement.evidence
         of_lines = np.maximum(of_lines, _of_healthy_lines(model, judgement, rng))
+        moving = judgement.observed.log.far & model.living
+        of_group, _ = model.groups.evidence(judgement.observed.log, moving)
+        of_groups = np.maximum(of_groups, of_group)
         healthy = np.setdiff1d(cells, dead)
         highest[:, healthy] = np.maximum(highest[:, healthy], evidence[:, healthy])
         every.append(evidence[:, healthy])
         longest = max(longest, len(record.units))
+        pieces = max(pieces, len(record))
     reached = np.concatenate(every, axis=1)
     tail = np.quantile(reached, 1 - _EXCEED / len(cells), axis=1)
-    lines = replace(model.lines, highest=of_lines.astype(np.float32), reached=longest)
-    return np.maximum(highest, tail[:, None]).astype(np.float32), lines, longest
+    model.highest = np.maximum(highest, tail[:, None]).astype(np.float32)
+    model.reached = longest
+    model.lines = replace(model.lines, highest=of_lines, reached=longest)
+    model.groups = replace(model.groups, highest=of_groups, reached=pieces)
 
 
 def _of_healthy_lines(model: Model, judgement: Judgement, rng: np.random.Generator) -> Array:
@@ -317,6 +340,6 @@ def _of_healthy_lines(model: Model, judgement: Judgement, rng: np.random.Generat
         out = model.lines.on[rng.integers(len(found))]
         for free in (np.ones_like(out), ~out):
             known = observed.known & free
-            evidence, _, _ = model.lines.evidence(observed, known, moving & free)
-            found = np.maximum(found, evidence)
+            evidence = model.lines.evidence(observed, known, moving & free)
+            found = np.maximum(found, evidence[0])
     return found

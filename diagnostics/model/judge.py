@@ -19,6 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import expit, logit, logsumexp
 
+from diagnostics.model.as_one import AsOne
+from diagnostics.model.groups import Groups
 from diagnostics.model.lines import Failing, Lines
 from diagnostics.model.observed import Log, Observed
 from diagnostics.model.over_time import USUAL, Units
@@ -59,7 +61,7 @@ class Judgement:
         known: bool, trusted cells.
         observed: what these say of the log.
         units: of the log.
-        failing: lines that fail now and then.
+        failing: lines and groups that fail now and then.
         disturbed: share of the cells that move which are refuted, where it is so large that none of
             them is faulty; else 0.
     """
@@ -86,7 +88,7 @@ class Model:
         odd: ``[D]``, share of the units in which each healthy cell is odd.
         highest: ``[ways, D]``, evidence of each way that a healthy cell reaches.
         reached: units of the longest log in which they did.
-        lines: of the array.
+        lines, groups: of the array.
     """
 
     symbols: Symbols
@@ -99,6 +101,7 @@ class Model:
     highest: Array
     reached: int
     lines: Lines
+    groups: Groups
 
     @classmethod
     def of(
@@ -110,16 +113,27 @@ class Model:
         present: Mask,
         living: Mask,
         lines: Lines,
+        groups: Groups,
     ) -> Model:
         """Return the model before healthy logs tell how odd cells are."""
         odd = np.full(len(present), USUAL, np.float32)
         highest = np.zeros((len(WAYS), len(present)), np.float32)
-        return cls(symbols, flatness, predictor, length, present, living, odd, highest, 1, lines)
+        return cls(
+            symbols, flatness, predictor, length, present, living, odd, highest, 1, lines, groups
+        )
 
     def recorder(self) -> Recorder:
         """Return what builds the record of a log that goes on and on."""
         most = max(_FEWEST_PIECES, _MOST_READINGS / len(self.present))
-        return Recorder(self.length, DITHER * self.symbols.rest.full, most)
+        return Recorder(self.length, DITHER * self.symbols.rest.full, most, self._as_one)
+
+    @property
+    def _as_one(self) -> AsOne | None:
+        return self.groups.as_one if len(self.groups.as_one.on) else None
+
+    def record_of(self, recordings: Sequence[NDArray[np.floating]]) -> Record:
+        """Return the record of a log, recordings ``[T, D]``."""
+        return record_of(recordings, self.length, self._as_one)
 
     def _certain(
         self, evidence: Array, units: Units, chosen: Sequence[int] | slice = slice(None)
@@ -141,7 +155,7 @@ class Model:
 
     def judge(self, recordings: Sequence[NDArray[np.floating]]) -> Judgement:
         """Judge a log, recordings ``[T, D]``."""
-        return self.judge_record(record_of(recordings, self.length))
+        return self.judge_record(self.record_of(recordings))
 
     def judge_record(self, record: Record, explained: Mask | None = None) -> Judgement:
         """Judge a record, with pieces of this model's length; ``explained`` cells (bool ``[D]``;
@@ -150,9 +164,10 @@ class Model:
         if explained is not None:
             log.received &= ~explained
             log.far &= ~explained
-        observed = self._by_trusted(log, np.zeros_like(log.far))
-        failing = self.lines.failing(observed, self.moving(log))
-        if failing.cells.any():
+        of_groups = self.groups.failing(log, log.far & self.living)
+        observed = self._by_trusted(log, of_groups.cells)
+        failing = self.lines.failing(observed, self.moving(log), of_groups)
+        if (failing.cells & ~of_groups.cells).any():
             observed = self._by_trusted(log, failing.cells)
         units = Units.of(observed, self.odd)
         evidence = np.stack([way.evidence(observed, units) for way in WAYS])
@@ -170,7 +185,7 @@ class Model:
             observed=observed,
             units=units,
             failing=failing,
-            disturbed=self._disturbed(log, probability),
+            disturbed=self._disturbed(log, probability, log.far & ~failing.cells),
         )
 
     def moving(self, log: Log) -> Mask:
@@ -230,9 +245,10 @@ class Model:
         return found
 
     @staticmethod
-    def _disturbed(log: Log, probability: Floats) -> float:
-        refuted = log.far & (log.run < HELD) & (probability > 0.5)
-        share = float(refuted.sum() / max(1, log.far.sum()))
+    def _disturbed(log: Log, probability: Floats, alone: Mask) -> float:
+        """Return the share of the cells that move ``alone`` (bool ``[D]``) which are refuted."""
+        refuted = alone & (log.run < HELD) & (probability > 0.5)
+        share = float(refuted.sum() / max(1, alone.sum()))
         return share if refuted.sum() >= _FEWEST and share > _DISTURBED else 0.0
 
 

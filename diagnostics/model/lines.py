@@ -5,10 +5,11 @@ cell one level up. It rests where the mean load of its cells is none, and a tabl
 
     P(rests | expected load, share of the cells beside it that are loaded, rested a piece ago)
 
-on the cross-fitted reference. The expected load is what the cells off the line say. As the table
-knows the piece before, the surprises of successive pieces are independent. A line that fails comes
-and goes, or is away where more than some load is expected; the worst one is left out of what the
-others say, and those are tested again.
+on the cross-fitted reference. The expected load is what the cells off the line say. A line that
+fails comes and goes, or is away where more than some load is expected. Contacts of one recording
+are alike, and healthy lines are odd in some recordings: either side errs in a share of those, so
+that a fault shows in several. The worst line is left out of what the others say, and those are
+tested again.
 
 Not detected: a line with fewer than three cells that move, or without others that tell of its load;
 one whose cells keep a load or another rest while it is away. A line that breaks once and for all is
@@ -27,14 +28,15 @@ from scipy.special import expit, logsumexp
 from diagnostics.layout import SensorLayout
 from diagnostics.model.conditional_mean import ConditionalMean
 from diagnostics.model.observed import Observed
-from diagnostics.model.over_time import Units, for_good, now_and_then
+from diagnostics.model.over_time import Units, coming_and_going, for_good
 from diagnostics.model.record import Array, Cells, Mask, Record
 from diagnostics.model.symbols import NOTHING
+from diagnostics.preprocessing.levels import CERTAIN_RATIO, DOUBTED, EXPECTED_LATE
 from diagnostics.wiring import LineKind
 
 FEWEST = 3  # cells that tell of a line
 _KINDS: tuple[LineKind, ...] = ("row", "column", "converter", "position", "bus", "group")
-_UNIT = 2  # pieces: a line flickers more quickly than cells come and go
+_BLOCK = 8  # units of a long recording that count as one
 _LEVELS = 16  # of the expected load
 _BESIDE = (0.01, 0.34, 0.67, 0.99)  # shares of the cells beside it, between levels
 _BEFORE = 3  # a piece ago: unknown, at rest, loaded
@@ -42,17 +44,21 @@ _ALL_LINES = 50.0  # pieces of all lines that weigh on the table of one
 _GUESS = 0.005  # of either state, in any context
 _AWAY = 0.95  # share of the pieces in which a line that is away rests
 _LIMITS = 4  # of the load beyond which a line opens
-_ODD = 3.0  # log ratio of a unit with which a healthy line is odd
-_ODD_UNITS = 50.0  # units of all lines that weigh on the share of one
+_ODD = 3.0  # evidence of a recording with which a healthy line is odd
+_ODD_RECORDINGS = 50.0  # of all lines, which weigh on the share of one
+_SEEN = 3.0  # over the recordings: the share of what was never seen in them
 _RARELY = 1e-3
 _OFTEN = 0.2
 _CERTAIN = 6.0  # evidence that a healthy line does not reach
 _SAFETY = 1.5
-_PRIOR = np.log(0.005)
-_PROVEN = np.log(9.0)  # log odds
+_RARE = float(np.log(EXPECTED_LATE))
+_PRIOR = _RARE - CERTAIN_RATIO / 2  # and there may be contacts unlike the reference's
+PROVEN = float(np.log(9.0) - _PRIOR)  # evidence: at odds of 9
 _MOST = 4  # lines that fail in a log: where more do, the whole array is disturbed
 _TELL = 0.5  # share of the cells beside a line that are known
-_SPEAKS = 0.5  # log ratio of a unit that tells of a line
+_SPEAKS = 0.5  # log ratio of a piece that tells of a line
+_PARTS = 8  # of the reference, with other cells and lines left out
+_LEFT_OUT = 0.15  # of the cells, at most
 _AGAINST = 1.0
 NO_HALF: Cells = np.zeros(0, np.intp)
 
@@ -67,9 +73,10 @@ class Failing:
         evidence: ``[D]``, of the worst line of each cell; 0: none.
         line: int ``[D]``, number of the line that fails, from 0; -1: none.
         probability: ``[D]``, that it does.
-        share: ``[D]``, of the tested units in which it was away.
-        since: int ``[D]``, first piece of those.
+        share: ``[D]``, of the tested pieces in which it was away.
+        since: int ``[D]``, number of the first frame of those.
         units: int ``[D]``, number of those.
+        as_one: bool ``[D]``, cells that read as one, instead of being at rest.
     """
 
     evidence: Floats
@@ -78,13 +85,14 @@ class Failing:
     share: Floats
     since: Cells
     units: Cells
+    as_one: Mask
 
     @classmethod
     def none(cls, n_cells: int) -> Failing:
         """Return that none does."""
         nothing = np.zeros(n_cells)
         number = np.zeros(n_cells, np.intp)
-        return cls(nothing, number - 1, nothing, nothing, number, number)
+        return cls(nothing, number - 1, nothing, nothing, number, number, number > 0)
 
     @property
     def cells(self) -> Mask:
@@ -92,16 +100,24 @@ class Failing:
         found: Mask = self.line >= 0
         return found
 
-    def with_one(self, on: Mask, evidence: float, ratio: Array, units: Units) -> Failing:
-        """Return the lines with one more: its cells, bool ``[D]``, and log ratio of each unit."""
+    @property
+    def doubted(self) -> Mask:
+        """bool ``[D]``, cells of lines that may fail."""
+        found: Mask = expit(self.evidence + _RARE) > DOUBTED
+        return found
+
+    def with_one(self, on: Mask, evidence: float, ratio: Array, since: int) -> Failing:
+        """Return the lines with one more: its cells, bool ``[D]``, log ratio of each piece, and
+        first frame."""
         away = ratio > _AGAINST
         share = (ratio > _SPEAKS).sum() / max(1, (np.abs(ratio) > _SPEAKS).sum())
-        return Failing(
+        return replace(
+            self,
             evidence=np.where(on, evidence, self.evidence),
             line=np.where(on, self.line.max() + 1, self.line),
             probability=np.where(on, expit(evidence + _PRIOR), self.probability),
             share=np.where(on, share, self.share),
-            since=np.where(on, units.begins[away.argmax()], self.since),
+            since=np.where(on, since, self.since),
             units=np.where(on, away.sum(), self.units),
         )
 
@@ -117,7 +133,7 @@ class Lines:
         resting: P(at rest | context) ``[1, W, M]``; while the model is fitted ``[halves, W, M]``,
             without each half of the recordings.
         half: int ``[n]``, of each piece, while the model is fitted; else empty.
-        odd: ``[W]``, share of the units in which each healthy line is odd.
+        odd: ``[W]``, share of the recordings in which each healthy line is odd.
         highest: ``[W]``, evidence that it reaches.
         reached: units of the longest log in which it did.
     """
@@ -192,54 +208,71 @@ class Lines:
 
     def evidence(
         self, observed: Observed, known: Mask, eligible: Mask
-    ) -> tuple[Array, Array, Units]:
-        """Return the evidence of each line ``[W]``, before the limits, and of each unit
-        ``[units, W]``; arguments as for :meth:`ratio`."""
+    ) -> tuple[Array, Array, Array, Units]:
+        """Return the evidence of each line ``[W]``, before the limits, that of each block
+        ``[blocks, W]``, the log ratio of each piece ``[n, W]``, and the blocks; arguments as for
+        :meth:`ratio`."""
         ratio, level = self.ratio(observed, known, eligible)
-        units = Units.of(observed, self.odd, units_of(observed.log.record))
-        comes_and_goes = now_and_then(ratio, units)
+        blocks = self._blocks(observed)
+        of_pieces = coming_and_going(ratio, observed.log.record.first)
+        of_blocks = blocks.of_units(of_pieces)
         opens = []
         for limit in np.linspace(1, len(self.predicted), _LIMITS).astype(np.intp):
             beyond = np.where(level >= limit, ratio, 0)
-            opens.append(units.of_units(beyond).sum(axis=0))
+            opens.append(blocks.of_units(beyond).sum(axis=0))
         under_load = logsumexp(opens, axis=0) - np.log(_LIMITS)
-        evidence = np.maximum(comes_and_goes, under_load)
+        evidence = np.maximum(of_blocks.sum(axis=0), under_load)
         enough = (self.on & eligible).sum(axis=1) >= FEWEST
         enough &= (self.beside & known).sum(axis=1) >= _TELL * self.beside.sum(axis=1)
-        enough &= evidence > for_good(ratio, units)
-        return np.where(enough, evidence, 0), units.of_units(ratio), units
+        enough &= evidence > for_good(ratio, blocks)
+        return np.where(enough, evidence, 0), of_blocks, ratio, blocks
 
-    def failing(self, observed: Observed, eligible: Mask) -> Failing:
-        """Return the lines that fail in a log; ``eligible``: bool ``[D]``, cells that move and hold
-        no load."""
-        failing = Failing.none(len(eligible))
-        longer = max(1.0, len(observed.log.record.units) / self.reached)
-        most = _SAFETY * longer * self.highest
-        factor = _CERTAIN / np.maximum(_CERTAIN, most)
+    def _blocks(self, observed: Observed) -> Units:
+        """Return the recordings of a log, in parts where they are long, as units."""
+        units = Units.of(observed, self.odd)
+        record = observed.log.record
+        recording = np.cumsum(units.opens)
+        first = np.flatnonzero(units.opens)
+        within = np.arange(len(recording)) - first[recording - 1]
+        opens = np.flatnonzero(within % _BLOCK == 0)
+        begins = units.begins[opens]
+        odd = np.maximum.reduceat(units.odd, opens, axis=0)
+        of_piece = np.searchsorted(begins, np.arange(len(record)), "right") - 1
+        return Units(begins, of_piece, odd, units.opens[opens])
+
+    def failing(self, observed: Observed, eligible: Mask, failing: Failing) -> Failing:
+        """Return the lines that fail in a log besides groups that are ``failing``; ``eligible``:
+        bool ``[D]``, cells that move and hold no load."""
+        of_groups = failing
+        record = observed.log.record
         found = 0
         while len(self.on):
             free = ~failing.cells
-            evidence, ratio, units = self.evidence(observed, observed.known & free, eligible & free)
-            evidence = evidence * factor
+            known = observed.known & free
+            evidence, of_blocks, ratio, blocks = self.evidence(observed, known, eligible & free)
+            evidence = within_limit(evidence, self.highest, len(record.units) / self.reached)
             on = self.on & eligible & free
             of_cell = np.where(on, evidence[:, None], 0).max(axis=0)
             failing = replace(failing, evidence=np.maximum(failing.evidence, of_cell))
             worst = int(evidence.argmax())
-            if evidence[worst] + _PRIOR <= _PROVEN:
+            if evidence[worst] <= PROVEN:
                 return failing
             if found == _MOST:
                 break
-            failing = failing.with_one(on[worst], float(evidence[worst]), ratio[:, worst], units)
+            against = of_blocks[:, worst] > _AGAINST
+            away = against[blocks.of_piece] & (ratio[:, worst] > _AGAINST)
+            since = int(record.begins[away.argmax()])
+            failing = failing.with_one(on[worst], float(evidence[worst]), ratio[:, worst], since)
             found += 1
-        return Failing.none(len(eligible))
+        return of_groups
 
 
-def units_of(record: Record) -> Cells:
-    """Return the first piece of each unit of a line, int ``[units]``."""
-    begins = record.units
-    lengths = np.diff(np.append(begins, len(record)))
-    within = np.arange(len(record)) - np.repeat(begins, lengths)
-    return np.flatnonzero(within % _UNIT == 0)
+def within_limit(evidence: Array, highest: Array, longer: float) -> Array:
+    """Return evidence so that what a healthy line reaches stays below certainty, in a log that is
+    so many times as long as those in which it did."""
+    most = _SAFETY * max(1.0, longer) * highest
+    found: Array = evidence * (_CERTAIN / np.maximum(_CERTAIN, most))
+    return found
 
 
 def cells_on(layout: SensorLayout, living: Mask, kinds: Collection[LineKind] = _KINDS) -> Mask:
@@ -281,15 +314,22 @@ def fit_lines(
     zero = np.zeros(len(on), np.float32)
     blank = Lines(on, beside, zero, np.zeros((1, len(on), 0), np.float32), NO_HALF, odd, zero, 1)
     means = blank.means(load, on)
-    expected = blank.expected(mean, load, living, on)
+    rests = means <= NOTHING
+    expected = np.zeros(means.shape)
+    parts = _parts(record, living, on)
+    for part, known in parts:
+        expected[part] = blank.expected(mean, load, known, on)[part]
     share = np.linspace(0, 1, _LEVELS // 2 + 1)[1:-1]
-    loaded = expected[means > NOTHING]
+    loaded = expected[~rests]
     edges = [np.quantile(some, share) for some in (expected, loaded) if some.size]
     predicted = np.unique(np.concatenate(edges)).astype(np.float32) if edges else zero
     blank = replace(blank, predicted=predicted)
-    rests = means <= NOTHING
-    context = blank.contexts(expected, rests, load, record.first, living)
-    told = blank.told(load, living)
+    context = np.zeros(means.shape, np.intp)
+    told = np.zeros(means.shape, bool)
+    for part, known in parts:
+        first = record.first[part]
+        context[part] = blank.contexts(expected[part], rests[part], load[part], first, known)
+        told[part] = blank.told(load[part], known)
     n_contexts = (len(predicted) + 1) * (len(_BESIDE) + 1) * _BEFORE
     counts = np.zeros((half.max() + 1, len(on), n_contexts, 2))
     line = np.broadcast_to(np.arange(len(on)), rests.shape)
@@ -298,6 +338,21 @@ def fit_lines(
     total = counts.sum(axis=0)
     fitted = replace(blank, resting=_resting(total)[None])
     return fitted, np.stack([_resting(total - of_half) for of_half in counts])
+
+
+def _parts(record: Record, living: Mask, on: Mask) -> list[tuple[slice, Mask]]:
+    """Return parts of the reference, and the known cells of each, bool ``[D]``: fewer and fewer,
+    without a line in every second part."""
+    rng = np.random.default_rng(0)
+    first = np.flatnonzero(record.first)
+    ends = [some[0] for some in np.array_split(first, _PARTS) if len(some)]
+    found = []
+    for k, (begin, end) in enumerate(zip(ends, [*ends[1:], len(record)], strict=True)):
+        known = living & (rng.random(len(living)) >= _LEFT_OUT * k / _PARTS)
+        if k % 2 and len(on):
+            known &= ~on[rng.integers(len(on))]
+        found.append((slice(int(begin), int(end)), known))
+    return found
 
 
 def _resting(counts: Floats) -> Array:
@@ -310,10 +365,11 @@ def _resting(counts: Floats) -> Array:
     return found
 
 
-def odd_of(ratio: Array) -> Array:
-    """Return in which share of the units ``[units, W]`` each healthy line is odd."""
-    odd = (ratio > _ODD).sum(axis=0)
-    pooled = max(odd.sum() / max(1, ratio.size), _RARELY)
-    share = (odd + _ODD_UNITS * pooled) / (len(ratio) + _ODD_UNITS)
-    found: Array = np.clip(share, _RARELY, _OFTEN).astype(np.float32)
+def odd_of(evidence: Array) -> Array:
+    """Return the share of the cases ``[n, W]`` in which each healthy line is odd."""
+    odd = (evidence > _ODD).sum(axis=0)
+    n = max(1, len(evidence))
+    pooled = odd.sum() / max(1, evidence.size)
+    share = (odd + _ODD_RECORDINGS * pooled) / (n + _ODD_RECORDINGS)
+    found: Array = np.clip(share, max(_RARELY, min(_SEEN / n, _OFTEN)), _OFTEN).astype(np.float32)
     return found

@@ -45,30 +45,22 @@ class Units:
     opens: Mask
 
     @classmethod
-    def of(cls, observed: Observed, odd: Array, begins: Cells | None = None) -> Units:
-        """Return the units of a log.
-
-        Args:
-            observed: the log.
-            odd: ``[D]``, share in which each healthy cell (or ``[W]``, line) is odd.
-            begins: int ``[units]``, first piece of each; None: those of the record.
-        """
+    def of(cls, observed: Observed, odd: Array) -> Units:
+        """Return the units of a log; ``odd``: ``[D]``, share in which each healthy cell is odd."""
         record = observed.log.record
-        if begins is None:
-            begins = record.units
         known = observed.known
         strange = (observed.odd & known).sum(axis=1)
         share = (strange + _SURE * USUAL) / (known.sum() + _SURE)
         here = np.clip(share[:, None] / USUAL * odd, _RARELY, _OFTEN)
-        of_piece = np.searchsorted(begins, np.arange(len(record)), "right") - 1
-        return cls(begins, of_piece, here[record.of_unit[begins]], record.first[begins])
+        return cls(record.units, record.of_unit, here, record.first[record.units])
 
     def of_units(self, ratio: Array) -> Array:
         """Return the evidence of each unit ``[units, D]`` of log ratios ``[n, D]``."""
-        return _bounded(np.add.reduceat(ratio, self.begins, axis=0), self.odd)
+        return bounded(np.add.reduceat(ratio, self.begins, axis=0), self.odd)
 
 
-def _bounded(ratio: Array, odd: Array) -> Array:
+def bounded(ratio: Array, odd: Array) -> Array:
+    """Return log ratios where either side errs in a share ``odd`` of the cases."""
     like = np.exp(np.clip(ratio, -_MOST, _MOST))
     found: Array = np.log(((1 - odd) * like + odd) / (1 - odd + odd * like))
     return found
@@ -88,7 +80,7 @@ def _since_each(ratio: Array, units: Units) -> Array:
     rest_of_unit = sums - behind[units.of_piece]
     whole = units.of_units(ratio)
     later = _from_here(whole) - whole
-    found: Array = _bounded(rest_of_unit, units.odd[units.of_piece]) + later[units.of_piece]
+    found: Array = bounded(rest_of_unit, units.odd[units.of_piece]) + later[units.of_piece]
     return found
 
 
@@ -127,22 +119,36 @@ def since(ratio: Array, units: Units) -> Cells:
 
 
 def now_and_then(ratio: Array, units: Units) -> Array:
-    """Return the evidence ``[D]`` of a fault that comes and goes: a two-state Markov chain over the
-    units of a recording (forward algorithm, Rabiner 1989), which begins anew with each. One that
-    was there once and has gone is none."""
+    """Return the evidence ``[D]`` of a fault that comes and goes. One that was there once and has
+    gone is none."""
     # a healthy cell that is odd now and then is what this fault looks like
     doubted = replace(units, odd=np.maximum(units.odd, USUAL))
-    likelihood = np.exp(doubted.of_units(ratio))
-    usual = _FAILS / (_FAILS + _RECOVERS)
-    gone = np.full(ratio.shape[1], usual)
-    total: Array = np.zeros(ratio.shape[1], np.float32)
-    for opens, unit in zip(units.opens.tolist(), likelihood, strict=True):
-        gone = gone * (1 - _RECOVERS) + (1 - gone) * _FAILS
-        if opens:
-            gone = np.full_like(gone, usual)
-        z = 1 - gone + gone * unit
-        total = total + np.log(z).astype(np.float32)
-        gone = gone * unit / z
-    of_units = np.log(likelihood)
+    of_units = doubted.of_units(ratio)
+    total: Array = coming_and_going(of_units, units.opens).sum(axis=0)
     once = of_units.cumsum(axis=0).max(axis=0) - np.log(len(of_units))
     return np.where(once > total, _unless_gone(total, of_units), total)
+
+
+def coming_and_going(
+    ratio: Array, opens: Mask, fails: float = _FAILS, recovers: float = _RECOVERS
+) -> Array:
+    """Return the evidence of each step ``[n, D]`` of a fault that comes and goes: a two-state
+    Markov chain (forward algorithm, Rabiner 1989).
+
+    Args:
+        ratio: log ratio faulty : healthy of each step, ``[n, D]``.
+        opens: bool ``[n]``, steps with which the chain begins anew.
+        fails, recovers: probability a step.
+    """
+    likelihood = np.exp(ratio)
+    usual = fails / (fails + recovers)
+    gone = np.full(ratio.shape[1], usual)
+    found: Array = np.zeros(ratio.shape, np.float32)
+    for i, step in enumerate(likelihood):
+        gone = gone * (1 - recovers) + (1 - gone) * fails
+        if opens[i]:
+            gone = np.full_like(gone, usual)
+        z = 1 - gone + gone * step
+        found[i] = np.log(z)
+        gone = gone * step / z
+    return found

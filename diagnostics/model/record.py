@@ -7,11 +7,13 @@ unit, in which a healthy cell may be odd, is a few successive pieces of one reco
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
+
+from diagnostics.model.as_one import AsOne
 
 Array = NDArray[np.float32]
 Mask = NDArray[np.bool_]
@@ -35,6 +37,7 @@ class Record:
         recording: int ``[n]``, from 0.
         begins: int ``[n]``, number of the first frame of each.
         n_frames: of the log.
+        as_one: ``[n, G]``, share of the frames in which each group reads as one.
     """
 
     low: Array
@@ -44,6 +47,7 @@ class Record:
     recording: Cells
     begins: Cells
     n_frames: int
+    as_one: Array = field(default_factory=lambda: np.zeros((0, 0), np.float32))
 
     def __len__(self) -> int:
         return len(self.begins)
@@ -142,8 +146,12 @@ class _Pieces:
         same[1:-1] &= self.recording[:-2] == self.recording[2:]
         return same
 
-    def record(self, n_frames: int) -> Record:
-        """Return the record of a log of ``n_frames``."""
+    def record(self, n_frames: int, groups: int) -> Record:
+        """Return the record of a log of ``n_frames``; the last columns are of ``groups``."""
+        if groups:
+            share = (self.total / self.frames[:, None])[:, -groups:].astype(np.float32)
+            found = self._of_cells(groups).record(n_frames, 0)
+            return replace(found, as_one=share)
         received = self.count > 0
         mean = (self.total / np.maximum(self.count, 1)).astype(np.float32)
         low = self.low
@@ -155,6 +163,17 @@ class _Pieces:
             mean = np.take_along_axis(mean, last, 0)
             mean[:, ~received.any(axis=0)] = np.nan
         return Record(low, high, mean, received, self.recording, self.begins, n_frames)
+
+    def _of_cells(self, groups: int) -> _Pieces:
+        """Return the pieces without the last columns."""
+        cells = np.s_[:, :-groups]
+        return replace(
+            self,
+            low=self.low[cells],
+            high=self.high[cells],
+            total=self.total[cells],
+            count=self.count[cells],
+        )
 
 
 @dataclass(frozen=True)
@@ -170,6 +189,7 @@ class Recorder:
         length: frames of a piece.
         tolerance: readings change by more.
         most: pieces that are kept, about.
+        as_one: finds the frames in which groups read as one; None: there are no groups.
         complete: pieces that no frame changes any more.
         last: the last two, which may.
         recordings: number of those that began.
@@ -179,6 +199,7 @@ class Recorder:
     length: int
     tolerance: float = 0.0
     most: float = np.inf
+    as_one: AsOne | None = None
     complete: tuple[_Pieces, ...] = ()
     last: _Pieces | None = None
     recordings: int = 0
@@ -205,6 +226,8 @@ class Recorder:
         begins = begins[fresh]
         if not len(frames):
             return self
+        if self.as_one is not None:
+            frames = np.hstack([frames, self.as_one(frames)])
         open_frames = 0
         if self.last is None:
             begins = begins | (np.arange(len(frames)) == 0)
@@ -263,7 +286,8 @@ class Recorder:
         run = self.last
         at_end = np.arange(len(run)) == len(run) - 1
         run = run.merged(self._too_short(run) & at_end)
-        return _Pieces.joined([*self.complete, run]).record(n_frames)
+        groups = 0 if self.as_one is None else len(self.as_one.on)
+        return _Pieces.joined([*self.complete, run]).record(n_frames, groups)
 
     def _too_short(self, run: _Pieces) -> Mask:
         """Return the pieces of less than half a length behind another of the same recording, bool
@@ -280,10 +304,12 @@ class Recorder:
         return (every.chosen(slice(-int(self.most * _KEPT), None)),)
 
 
-def record_of(recordings: Sequence[NDArray[np.floating]], length: int) -> Record:
+def record_of(
+    recordings: Sequence[NDArray[np.floating]], length: int, as_one: AsOne | None = None
+) -> Record:
     """Return the record of recordings ``[T, D]`` each, with ``length`` frames a piece; NaN:
-    missing."""
-    recorder = Recorder(length)
+    missing. ``as_one``: of :class:`Recorder`."""
+    recorder = Recorder(length, as_one=as_one)
     frame = 0
     for one in recordings:
         recorder = recorder.extend(one, frame + np.arange(len(one)))

@@ -45,7 +45,7 @@ _BESIDE = 0.3  # probability that an object loads the cell beside a loaded one
 _SHIELDED = 0.05  # share of the cells of an object that no contact reaches
 _FLOOR = 0.2  # quantile of what a cell holds at most: contacts add to it
 _NEARLY_ALL = 0.95  # of the pieces
-_NOISY = 0.5  # P(constant at rest) of a cell with noise, less
+_NOISY = 0.9  # P(constant | constant before, at rest) of a cell with noise, at most
 _BLAMED = 0.5
 
 Floats = NDArray[np.float64]

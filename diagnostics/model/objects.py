@@ -17,7 +17,7 @@ No object holds a cell at full scale, nor takes the noise that it had at rest; n
 read the same is one, nor what a cell may share with its pad; some cells of the pad rest beside it.
 
 Not detected: objects on fewer than three cells; objects that explain no faulty cell; those of whose
-cells the last contact may still go on; one on a whole pad.
+cells the last contact may still go on; one on a whole pad, or that keeps contacts off its cells.
 """
 
 from __future__ import annotations
@@ -42,7 +42,6 @@ _FEWEST = 3  # cells of an object
 _ROUNDS = 3
 _EXPECTED_OBJECTS = 0.1  # prior probability of an object in a log
 _BESIDE = 0.3  # probability that an object loads the cell beside a loaded one
-_SHIELDED = 0.05  # share of the cells of an object that no contact reaches
 _FLOOR = 0.2  # quantile of what a cell holds at most: contacts add to it
 _NEARLY_ALL = 0.95  # of the pieces
 _NOISY = 0.9  # P(constant | constant before, at rest) of a cell with noise, at most
@@ -242,18 +241,11 @@ class _Chain:
         """Return the comparison for the cells that may hold a load, bool ``[D]``; other arguments
         as for :func:`find_objects`."""
         others = judgement.known & ~holds
-        still = held.still(log) & holds
-        noise = _constant_at_rest(model) < np.log(_NOISY)
         without = model.observed(model.log_of_record(held.without(log, holds, model)), others)
         units = judgement.units
-        # no contact may reach what lies under it, but it takes no noise away
-        lost = np.where(still & noise & (log.flat == CONSTANT), -_constant_at_rest(model), 0)
-        most = units.of_units(lost).sum(axis=0) - np.log(_SHIELDED)
         dead = model.evidence_of_any(without, units)
         blamed = model.evidence_of_any(model.observed(log, others), units)
         healthy = np.maximum(dead, 0) - np.maximum(blamed, 0)
-        shielded = (still | ~held.during(log)).all(axis=0)
-        dead = np.where(shielded, np.minimum(dead, most), dead)
         load = root_load(np.where(holds, held.load, 0), log.symbols.rest)
         edges = np.append(log.symbols.edges, 1.0)
         level = np.clip(np.searchsorted(edges, load, "right"), 1, len(edges) - 1) - 1

@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -117,7 +118,8 @@ class _Judged:
         shown: bool ``[D]``, cells that depend on the others as healthy ones do.
         contradicting: share of the cells that contradict them, where nobody is blamed for it.
         evidence: by name, ``[D]``.
-        life: the proof of life, to test lines with; None: they are not tested.
+        pulled: returns the cells on lines that shorted crossings pull, bool ``[D]``, of these cells
+            and of those that are faulty, bool ``[D]``; None: lines are not tested.
     """
 
     found: CellFindings
@@ -126,7 +128,7 @@ class _Judged:
     shown: NDArray[np.bool_]
     contradicting: float
     evidence: Mapping[str, NDArray[np.float64]]
-    life: Life | None = None
+    pulled: Callable[[NDArray[np.intp], NDArray[np.bool_]], NDArray[np.bool_]] | None = None
 
 
 def _no_progress(share: float) -> None:
@@ -640,6 +642,7 @@ class SelfDiagnosis:
             shown=shown(judgement),
             contradicting=judgement.disturbed,
             evidence=evidence,
+            pulled=partial(model.lines.pulled, judgement.observed),
         )
 
     def _by_events(self, stream: StreamState, life: Life | None) -> _Judged:
@@ -692,7 +695,7 @@ class SelfDiagnosis:
             shown=stream.touched & (life.shown | (stream.reference.dead > 0)),
             contradicting=life.contradicting,
             evidence=evidence,
-            life=life if tests_lines else None,
+            pulled=partial(self._pulled, stream, life) if tests_lines else None,
         )
 
     def _concluded(self, stream: StreamState, judged: _Judged, n_recordings: int) -> Diagnosis:
@@ -712,8 +715,9 @@ class SelfDiagnosis:
         # Noise alone is no test; nor is movement, where the reference tells how cells depend on
         # each other; nor is a line that a shorted crossing pulls.
         shown = judged.shown
-        if judged.life is not None:
-            pulled = self._pulled(stream, judged.life, causes, inferred)
+        shorts = [f.cells[0] for f in causes if f.kind is FaultKind.SHORT and f.line is None]
+        if judged.pulled is not None and shorts:
+            pulled = judged.pulled(self._place[np.array(shorts)], inferred[self._order])
             causes = pulling(causes, pulled[self._place], self.layout)
             shown = shown & ~pulled
         if self._of_log or self.reference_ is None:
@@ -785,23 +789,18 @@ class SelfDiagnosis:
         pad = self.layout.pad_of
         return np.asarray(unused & np.isin(pad, pad[unused & blamed]))
 
+    @staticmethod
     def _pulled(
-        self,
-        stream: StreamState,
-        life: Life,
-        causes: Sequence[Fault],
-        faulty: NDArray[np.bool_],
+        stream: StreamState, life: Life, shorted: NDArray[np.intp], faulty: NDArray[np.bool_]
     ) -> NDArray[np.bool_]:
         """Return the cells on lines that a shorted crossing pulls, bool ``[D]``; ``faulty`` ones
-        (bool ``[D]``), those of the ``causes``, tell nothing of a line."""
-        shorts = [f.cells[0] for f in causes if f.kind is FaultKind.SHORT and f.line is None]
+        (bool ``[D]``) tell nothing of a line."""
         evidence = None
-        if shorts and stream.reference.life is not None and not stream.noisier:
+        if stream.reference.life is not None and not stream.noisier:
             evidence = stream.evidence_of_life()
         if evidence is None:
-            return np.zeros(self.layout.n_cells, bool)
-        known = stream.received & ~stream.silent & ~life.refuted & ~faulty[self._order]
-        shorted = self._place[np.asarray(shorts)]
+            return np.zeros_like(faulty)
+        known = stream.received & ~stream.silent & ~life.refuted & ~faulty
         return pulled_lines(evidence.log, shorted, known)
 
     @staticmethod

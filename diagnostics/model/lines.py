@@ -32,6 +32,7 @@ from diagnostics.model.over_time import Units, coming_and_going, for_good
 from diagnostics.model.record import Array, Cells, Mask, Record
 from diagnostics.model.symbols import NOTHING
 from diagnostics.preprocessing.levels import CERTAIN_RATIO, DOUBTED, EXPECTED_LATE
+from diagnostics.preprocessing.levels import FEWEST as FEWEST_LOADED
 from diagnostics.wiring import LineKind
 
 FEWEST = 3  # cells that tell of a line
@@ -60,6 +61,8 @@ _SPEAKS = 0.5  # log ratio of a piece that tells of a line
 _PARTS = 8  # of the reference, with other cells and lines left out
 _LEFT_OUT = 0.15  # of the cells, at most
 _AGAINST = 1.0
+_OUTLYING = 1.645 * 1.48  # median absolute deviations: one-sided, 5 %
+_PULLED = float(np.log(2 / 3)) / 2  # of the root load
 NO_HALF: Cells = np.zeros(0, np.intp)
 
 Floats = NDArray[np.float64]
@@ -265,6 +268,41 @@ class Lines:
             failing = failing.with_one(on[worst], float(evidence[worst]), ratio[:, worst], since)
             found += 1
         return of_groups
+
+    def pulled(self, observed: Observed, shorted: Cells, faulty: Mask) -> Mask:
+        """Return the cells on lines that a shorted crossing pulls, bool ``[D]``.
+
+        Where the layers of a cell touch, a resistive array reads the rest of its row and column
+        through it: a part of their load each. They read less together, and so agree with each
+        other. With d the log ratio of the summed loads of a line and those that the others expect,
+        it is pulled where d lies below the 0.05 quantile of a normal distribution with the median
+        and the robust deviation of the other lines, and its load below two thirds.
+
+        Args:
+            observed: the log.
+            shorted: int, the cells that are shorted.
+            faulty: bool ``[D]``, cells that tell nothing of their line.
+        """
+        load = observed.log.load
+        known = observed.known & ~faulty
+        crossing = self.on[:, shorted].any(axis=1)
+        # those on the lines in question tell nothing of the others
+        tells = known & ~self.on[crossing].any(axis=0)
+        of = self.on & known
+        expected = self.expected(observed.predictor.mean, load, tells, of)
+        loaded = expected > NOTHING
+        total = np.where(loaded, self.means(load, of), 0).sum(axis=0)
+        wanted = np.where(loaded, expected, 0).sum(axis=0)
+        ratio = np.log(np.maximum(total, NOTHING) / np.maximum(wanted, NOTHING))
+        ratio = np.where(loaded.sum(axis=0) >= FEWEST_LOADED, ratio, np.nan)
+        others = ratio[~crossing & np.isfinite(ratio)]
+        if len(others) < FEWEST_LOADED:
+            return np.zeros_like(faulty)
+        middle = np.median(others)
+        least = middle - _OUTLYING * np.median(np.abs(others - middle))
+        low = crossing & (ratio < least) & (ratio < middle + _PULLED)
+        found: Mask = self.on[low].any(axis=0)
+        return found
 
 
 def within_limit(evidence: Array, highest: Array, longer: float) -> Array:

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from diagnostics import FaultKind, Line, SelfDiagnosis, SensorLayout, Verdict
 from diagnostics.model.conditional_mean import ConditionalMean, Tile
 from diagnostics.model.lines import cells_on
+from diagnostics.simulation.circuit import Circuit, StuckCell
 
 LAYOUT = SensorLayout(1, 8, 8, full_scale=4095.0, rate=20.0, unit="count")
 FRAMES = 60
@@ -141,3 +142,25 @@ def test_a_broken_row_beside_untested_cells_is_a_row(fitted, log):
         frames[:, cells] = REST
     (fault,) = fitted.diagnose(log[:8]).faults
     assert (fault.kind, fault.line) == (FaultKind.OPEN, Line(0, "row", 3))
+
+
+def test_cells_that_read_a_part_of_their_load_through_a_shorted_crossing_are_not_called_alive(
+    fitted, log
+):
+    cell = 27
+    circuit = Circuit(LAYOUT)
+    load = np.concatenate(log) - REST
+    pulls = circuit.with_faults(StuckCell(cell, 0.0)).read(load) - circuit.read(load)
+    pulled = np.clip(np.concatenate(log) + pulls, 0, 4095)
+    alone = np.concatenate(log)
+    alone[:, cell] = 4095.0
+    wrong = (np.abs(pulls) > 200).sum(axis=0) >= 10
+    wrong[cell] = False
+    assert wrong.sum() > 5
+    found = [fitted.diagnose(np.split(frames, len(log))) for frames in (pulled, alone)]
+    fault = next(fault for fault in found[0].faults if cell in fault.cells)
+    assert fault.cells == (cell,)
+    assert "cells of its row and column read a part of their load through it" in fault.reason
+    assert "through it" not in found[1].faults[0].reason
+    alive = [(one.verdicts == Verdict.ALIVE)[wrong].sum() for one in found]
+    assert alive[0] < alive[1] / 2

@@ -45,7 +45,8 @@ if TYPE_CHECKING:
     )
     from adaptfault.inspection.findings import Findings
     from adaptfault.inspection.guard import GuardError, guard
-    from adaptfault.inspection.inspection import Finding, Inspection, inspect
+    from adaptfault.inspection.inspection import inspect
+    from adaptfault.inspection.result import Finding, Inspection
     from adaptfault.models.builders import allow_model, build_model
     from adaptfault.models.history import History
     from adaptfault.models.network import TactileTransformer
@@ -141,7 +142,7 @@ _HOMES = {
     "CellImputer": "imputation.scikit_learn",
     "FaultTolerantClassifier": "imputation.scikit_learn",
     "FaultTolerantRegressor": "imputation.scikit_learn",
-    "Finding": "inspection.inspection",
+    "Finding": "inspection.result",
     "Findings": "inspection.findings",
     "Fleet": "fleet.listing",
     "FleetReport": "fleet.summary",
@@ -149,7 +150,7 @@ _HOMES = {
     "GuardError": "inspection.guard",
     "History": "models.history",
     "Inference": "prediction.inference",
-    "Inspection": "inspection.inspection",
+    "Inspection": "inspection.result",
     "MaintenanceReport": "robot.maintenance_report",
     "NotAuthentic": "acquisition",
     "Predictor": "prediction.predictor",

@@ -14,7 +14,7 @@ from rows import IN_USE, Bench, Count, Tally, draw_faults, highest, rest_levels
 
 import adaptfault as af
 from adaptfault.bench.changes import STUCK_KINDS, Log, broken, parted
-from adaptfault.inspection.inspection import OF_CELLS
+from adaptfault.inspection.result import OF_CELLS
 from diagnostics import Monitor
 
 BESIDE = 0.08  # share of the cells that are dead beside a disturbance

@@ -38,7 +38,7 @@ from diagnostics.decision.static_loads import find_static_loads
 from diagnostics.events.constant_runs import SHORTEST_RUN
 from diagnostics.evidence.life import PIECE, Life
 from diagnostics.evidence.life.pulled_lines import pulled_lines
-from diagnostics.evidence.reference import Reference, highest_reading, living, tolerance_of
+from diagnostics.evidence.reference import Reference, highest_reading, living
 from diagnostics.evidence.spatial import Exclusion, Spatial
 from diagnostics.evidence.stream_state import StreamState
 from diagnostics.faults import Fault, FaultKind
@@ -62,6 +62,7 @@ from diagnostics.preprocessing.levels import (
 from diagnostics.preprocessing.load import LoadDirection
 from diagnostics.preprocessing.quantiles import known_quantile
 from diagnostics.preprocessing.readings import RecordingBlocks
+from diagnostics.preprocessing.tolerance import tolerance_of
 from diagnostics.sensor.crosstalk import Crosstalk, find_crosstalk, lowest_floors
 from diagnostics.sensor.gain import UsualSizes, without_gain
 from diagnostics.sensor.odd_frames import evenly

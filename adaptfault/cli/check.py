@@ -22,6 +22,7 @@ from adaptfault.cli.shared_options import (
 if TYPE_CHECKING:
     from adaptfault.data.recordings import Opened, Recordings
     from adaptfault.inspection.data_set import DataSetCheck
+    from adaptfault.inspection.findings import FailOn
 
 
 class Check(Inspecting):
@@ -41,6 +42,10 @@ class Check(Inspecting):
     healthy: str | None = option(
         "recordings of the data set that are known to be healthy, as 0:20 for the first 20",
         "FIRST:LAST",
+    )
+    quick: bool = option(
+        "one pass over the readings, without a model of the cells: finds what holds a value in some"
+        " recordings; no cell is tested"
     )
     groups: Read | None = option(
         "what else divides the recordings, with which a fault may coincide: CSV table with the"
@@ -81,6 +86,8 @@ class Check(Inspecting):
         from adaptfault.inspection.naming import Naming
 
         fails = None if self.fail_on is None else FailOn.parse(self.fail_on)
+        if self.quick:
+            return self._quick(fails)
         if self.write_valid:
             from adaptfault.data.recordings.valid import refuse_foreign
 
@@ -120,6 +127,49 @@ class Check(Inspecting):
         self._tell(checked, notes)
         return code
 
+    def _quick(self, fails: FailOn | None) -> int:
+        """Check a data set in one pass."""
+        from adaptfault.inspection.check_log import check_log, classes_of
+        from adaptfault.inspection.groupings import coincide, data_sets_of, read_groupings
+        from adaptfault.inspection.naming import Naming
+        from adaptfault.inspection.quick import quick
+
+        self._refuse_beside_quick()
+        log = self.open(self.recordings)
+        self.say_inferred(log.inferred)
+        report_range(log)
+        groupings = dict(data_sets_of(log, self.recordings))
+        if self.groups is not None:
+            groupings |= read_groupings(self.groups, log.names)
+        classes = classes_of(log)
+        found = quick(log, classes)
+        if classes is not None:
+            groupings["class"] = classes
+        also = coincide(found.inspection.diagnosis, groupings)
+        findings = [
+            replace(one, severity=self.untested_code) if one.name == "untested" else one
+            for one in (*found.inspection.findings, *also)
+        ]
+        found = replace(found, inspection=replace(found.inspection, findings=tuple(findings)))
+        checked = check_log(
+            log,
+            found.named(Naming.of(log)),
+            left_out=self.left_out,
+            grouped=bool(groupings),
+            source=", ".join(self.recordings),
+        )
+        code = checked.severity if fails is None else checked.findings.failed(fails)
+        _write(self, log, checked, code, [])
+        self._tell(checked, [])
+        return code
+
+    def _refuse_beside_quick(self) -> None:
+        """Raise ValueError where an option needs tested cells."""
+        for name in ("reference", "healthy", "html", "write_valid", "write_copy"):
+            if getattr(self, name):
+                typed = "--" + name.replace("_", "-")
+                raise ValueError(f"{typed} needs tested cells: leave out --quick")
+
     def _tell(self, checked: DataSetCheck, notes: list[str]) -> None:
         """Print the result in the form that was asked for."""
         from adaptfault.inspection.findings import with_codes
@@ -131,6 +181,9 @@ class Check(Inspecting):
             text = findings.github(numbering, checked.advice)
         elif self.format == "markdown":
             text = findings.markdown(numbering, checked.advice)
+        elif self.quick:
+            told = numbering.text("\n".join([*map(str, checked.advice), str(findings)]))
+            text = f"{numbering.text(checked.naming.text(str(checked.summary)))}\n\n{told}"
         else:
             say = checked.naming.text
             told = text_of(checked.inspection.diagnosis, notes, self.count_from, say)
@@ -143,7 +196,10 @@ class Check(Inspecting):
                 summary += f"\n{'pads':12s} {told_pads}"
             text = "\n".join([f"{summary}\n\n{told}", *left, findings.summary()])
         self.json |= self.format == "json"
-        self.emit(checked.to_dict(), text)
+        if self.json:
+            self.emit(checked.to_dict(), text)
+        else:
+            self.emit({}, text)
 
 
 add = Check.add

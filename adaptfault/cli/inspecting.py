@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     from adaptfault.bundle.bundle import Bundle
     from adaptfault.data.recordings import Opened, Recordings
-    from adaptfault.inspection.inspection import Finding, Inspection
+    from adaptfault.inspection.result import Finding, Inspection
     from adaptfault.inspection.severity import Reason
     from diagnostics import Diagnosis, SelfDiagnosis
 

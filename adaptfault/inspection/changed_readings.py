@@ -2,37 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from diagnostics import Diagnosis, FaultKind, FaultSet, SelfDiagnosis
-from diagnostics.preprocessing.levels import EXPECTED, LEAST_LOADED
-from diagnostics.sensor.another_sensor import AnotherSensor, find_another_sensor
-from diagnostics.sensor.recalibration import Recalibration, find_recalibration, recalibrated
-from diagnostics.sensor.rewiring import Rewiring
-from diagnostics.sensor.sensor_change import SensorChange, find_change
-from diagnostics.sensor.swapped_in_part import SwappedInPart, newest_contradict
-
 if TYPE_CHECKING:
     from adaptfault.bundle.versions import Version
-
-_OF_ANY_SENSOR = (
-    FaultKind.OPEN,
-    FaultKind.SHORT,
-    FaultKind.STUCK,
-    FaultKind.INTERMITTENT,
-    FaultKind.ALIAS,
-    FaultKind.COPY,
-)
+    from diagnostics import Diagnosis
+    from diagnostics.sensor.another_sensor import AnotherSensor
+    from diagnostics.sensor.recalibration import Recalibration
+    from diagnostics.sensor.rewiring import Rewiring
+    from diagnostics.sensor.swapped_in_part import SwappedInPart
 
 Frames = list[NDArray[np.float64]]
-
-FEWEST = 12
-"""Recordings of a log, in whose halves a change is found again."""
 
 
 @dataclass(frozen=True)
@@ -72,34 +56,6 @@ class ChangedReadings:
             "replaced_pads": () if self.recalibration is None else self.recalibration.pads,
         }
 
-    def doubt(self, diagnoser: SelfDiagnosis) -> str | None:
-        """Return why the change is no reason for a new version, in one sentence; None where it is.
-
-        It must be found again, alike, in the older half of the log, in the newer half, and in the
-        newest recordings: one part of a log does not decide about all that follows.
-
-        Args:
-            diagnoser: fitted; with it the change was found.
-        """
-        if self.recalibration is not None and not self.recalibration.throughout:
-            return "not each half of the recordings shows it by itself; record more"
-        if self.rewiring is None:
-            return None
-        n = len(self.frames)
-        if n < FEWEST:
-            return f"{n} recordings do not prove it, record at least {FEWEST}"
-        came = np.argsort(self.rewiring.source)
-        frames = [recording[:, came] for recording in self.frames]
-        halves = {"older": frames[: n // 2], "newer": frames[n // 2 :]}
-        for name, half in halves.items():
-            if not _found_again(diagnoser, half, self.rewiring):
-                return f"the {name} half of the recordings does not show it by itself, record more"
-        assert diagnoser.reference_ is not None  # a rewiring was found with it
-        loads = as_loads(diagnoser, frames)
-        if newest_contradict(self.rewiring, loads, diagnoser.reference_, diagnoser.layout):
-            return "the newest recordings contradict it"
-        return None
-
     def readings(self, version: Version) -> dict[str, list[Any]]:
         """Return how a version undoes the change, on top of what ``version`` undoes; see
         ``Version.readings``."""
@@ -129,202 +85,6 @@ class ChangedReadings:
             return self.rewiring.undo(x)
         if self.recalibration is None:
             return x
+        from diagnostics.sensor.recalibration import recalibrated  # slow to import
+
         return recalibrated(x, self.recalibration.gain, self.recalibration.offset / full_scale, 1.0)
-
-
-def find_changed_readings(
-    diagnoser: SelfDiagnosis,
-    frames: Frames,
-    healthy: Sequence[NDArray[Any]],
-    *,
-    disturbed: bool = False,
-    comparable: bool = True,
-) -> ChangedReadings:
-    """Return what changed between cells and readings, and the diagnosis with it undone.
-
-    Args:
-        diagnoser: fitted, or not: then nothing is found.
-        frames: recordings ``[T, D]``, as the running version undoes them.
-        healthy: those of the reference, with which pads are compared.
-        disturbed: a disturbance of the array may explain what differs: then no pad counts as
-            replaced, and wires as exchanged only where fewer cells are faulty once they are put
-            back.
-        comparable: readings are neither cut off nor rounded otherwise than the reference: they tell
-            one sensor from another.
-    """
-    exchanged = _put_back(diagnoser, frames)
-    as_found = ChangedReadings(None, None, frames, diagnoser.diagnose(frames))
-    another = None
-    if exchanged is None and comparable:
-        another = _another(diagnoser, as_found, healthy)
-    if another is not None and not another.is_whole:
-        left = another.left_out(frames)
-        return ChangedReadings(None, None, left, _left(diagnoser.diagnose(left)), another=another)
-    if disturbed and (exchanged is None or exchanged.diagnosis.n_lost >= as_found.diagnosis.n_lost):
-        return as_found if another is None else _as_another(as_found, another)
-    replaced = _with_new_gains(diagnoser, as_found, healthy, exchanged)
-    if replaced is not None:
-        return as_found if disturbed else replaced
-    if another is not None:
-        return _as_another(as_found, another)
-    return exchanged or as_found
-
-
-def _as_another(as_found: ChangedReadings, another: AnotherSensor) -> ChangedReadings:
-    """Return a log of another sensor."""
-    diagnosis = _of_any_sensor(as_found.diagnosis, another.pads)
-    return replace(as_found, diagnosis=diagnosis, another=another)
-
-
-def _another(
-    diagnoser: SelfDiagnosis, as_found: ChangedReadings, healthy: Sequence[NDArray[Any]]
-) -> AnotherSensor | None:
-    """Return which recordings come from another sensor than the reference; None: none, or nothing
-    tells."""
-    load = diagnoser.load_
-    unknown = diagnoser.layout.axes > 1 or (load is not None and load.direction == "middle")
-    if diagnoser.reference_ is None or unknown:
-        return None
-    diagnosis = as_found.diagnosis
-    frames = diagnoser.without_gain(as_found.frames) or as_found.frames
-    return find_another_sensor(
-        as_loads(diagnoser, list(frames)),
-        as_loads(diagnoser, healthy),
-        diagnoser.reference_,
-        diagnoser.layout,
-        _faulty(diagnosis) | diagnosis.disturbed.mask,
-    )
-
-
-def _left(diagnosis: Diagnosis) -> Diagnosis:
-    """Return the diagnosis of a log of which recordings are left out: these are not lost."""
-    transport = tuple(one for one in diagnosis.transport if one.kind != "lost")
-    return replace(diagnosis, transport=transport)
-
-
-def _of_any_sensor(diagnosis: Diagnosis, pads: Sequence[int]) -> Diagnosis:
-    """Return a diagnosis of pads that are not those of the reference: it tells which of their cells
-    hold a value or repeat another, not how much they should read."""
-    on = np.isin(diagnosis.layout.pad_of, pads)
-    holds = [fault for fault in diagnosis.faults if fault.kind in _OF_ANY_SENSOR]
-    faults = [fault for fault in diagnosis.faults if fault in holds or not on[[*fault.cells]].all()]
-    untold = diagnosis.fault_set.mask.copy()
-    untold[[cell for fault in faults for cell in fault.cells]] = False
-    return replace(
-        diagnosis,
-        faults=tuple(faults),
-        tested=diagnosis.tested & ~untold,
-        probability=np.where(untold, EXPECTED, diagnosis.probability),
-    )
-
-
-def _with_new_gains(
-    diagnoser: SelfDiagnosis,
-    as_found: ChangedReadings,
-    healthy: Sequence[NDArray[Any]],
-    exchanged: ChangedReadings | None,
-) -> ChangedReadings | None:
-    """Return a log with replaced pads undone; None where none is, or where exchanged wires explain
-    the log better."""
-    rival = None if exchanged is None else exchanged.frames
-    recalibration = _recalibration(diagnoser, as_found, healthy, rival)
-    if recalibration is None:
-        return None
-    full_scale = diagnoser.layout.full_scale
-    undone = [recalibration.undo(recording, full_scale) for recording in as_found.frames]
-    diagnosis = _of_any_sensor(diagnoser.diagnose(undone), recalibration.pads)
-    return ChangedReadings(None, recalibration, undone, diagnosis, as_found)
-
-
-def _found_again(diagnoser: SelfDiagnosis, frames: Frames, rewiring: Rewiring) -> bool:
-    """Return whether recordings show the same exchange of wires by themselves."""
-    again = diagnoser.rewiring(frames)
-    return again is not None and np.array_equal(again.source, rewiring.source)
-
-
-def _put_back(diagnoser: SelfDiagnosis, frames: Frames) -> ChangedReadings | None:
-    """Return a log with exchanged wires put back, in the recordings in which they are; None where
-    none are, or only with a gain of the whole array: a pad that reads more is like another pad."""
-    usual = diagnoser.without_gain(frames)
-    in_part = diagnoser.swapped_in_part(frames)
-    if in_part is not None and usual is not None:
-        again = diagnoser.swapped_in_part(usual)
-        if again is None or not np.array_equal(again.source, in_part.source):
-            in_part = None
-    if in_part is not None:
-        put_back = in_part.undo(frames)
-        return ChangedReadings(None, None, put_back, diagnoser.diagnose(put_back), in_part=in_part)
-    rewiring = diagnoser.rewiring(frames)
-    if rewiring is None:
-        return None
-    if usual is not None and not _found_again(diagnoser, list(usual), rewiring):
-        return None
-    put_back = [rewiring.undo(recording) for recording in frames]
-    return ChangedReadings(rewiring, None, put_back, diagnoser.diagnose(put_back))
-
-
-def find_sensor_change(
-    diagnoser: SelfDiagnosis, readings: ChangedReadings, healthy: Sequence[NDArray[Any]]
-) -> SensorChange | None:
-    """Return how a pad, or all cells together, differ from the healthy recordings; None where they
-    do not.
-
-    Faulty cells, those of possible wires, and those that a static load may reach do not count.
-
-    Args:
-        diagnoser: fitted.
-        readings: of the log.
-        healthy: recordings ``[T, D]`` of the reference.
-    """
-    diagnosis = readings.diagnosis
-    possible = tuple({cell for wire in diagnosis.possible for cell in wire.cells})
-    excluded = (
-        diagnosis.fault_set | diagnosis.disturbed | FaultSet(possible, diagnoser.layout.n_cells)
-    )
-    loads = as_loads(diagnoser, readings.frames)
-    return find_change(loads, as_loads(diagnoser, healthy), diagnoser.layout, excluded)
-
-
-def as_loads(diagnoser: SelfDiagnosis, recordings: Sequence[NDArray[Any]]) -> list[NDArray[Any]]:
-    """Return recordings ``[T, D]`` as loads, where readings fall with the load or rest in the
-    middle."""
-    load = diagnoser.load_
-    return list(recordings) if load is None else [load.loads(recording) for recording in recordings]
-
-
-def _recalibration(
-    diagnoser: SelfDiagnosis,
-    as_found: ChangedReadings,
-    healthy: Sequence[NDArray[Any]],
-    rival: Frames | None,
-) -> Recalibration | None:
-    """Return how replaced pads read; None where none is replaced, or ``rival``, the log with wires
-    put back, is more likely."""
-    diagnosis = as_found.diagnosis
-    if diagnoser.load_ is not None or diagnoser.reference_ is None or not healthy:
-        return None
-    held = diagnosis.statically_loaded.mask
-    return find_recalibration(
-        as_found.frames,
-        healthy,
-        diagnoser.reference_,
-        diagnoser.layout,
-        _faulty(diagnosis),
-        held,
-        rival=rival,
-    )
-
-
-def _faulty(diagnosis: Diagnosis) -> NDArray[np.bool_]:
-    """Return the faulty cells that tell nothing of a new pad, bool ``[D]``: many cells of one have
-    other gains and offsets."""
-    layout = diagnosis.layout
-    faulty = diagnosis.fault_set.mask.copy()
-    otherwise = np.zeros(layout.n_cells, bool)
-    for fault in diagnosis.faults:
-        otherwise[list(fault.cells)] = fault.kind in (FaultKind.DRIFT, FaultKind.WEAK)
-    for pad in range(layout.pads):
-        on = layout.present.ravel() & (layout.pad_of == pad)
-        if (on & otherwise).sum() > LEAST_LOADED * on.sum():
-            faulty[on & otherwise] = False
-    return faulty

@@ -19,7 +19,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,14 +29,17 @@ from adaptfault.data.summary import Summary
 from adaptfault.inspection.code import Need
 from adaptfault.inspection.codes import unchecked
 from adaptfault.inspection.findings import Findings, Unchecked, unchecked_for_want
-from adaptfault.inspection.inspection import Finding, Inspection
 from adaptfault.inspection.leave_out import LeaveOut
 from adaptfault.inspection.naming import Naming
+from adaptfault.inspection.result import Finding, Inspection
 from adaptfault.inspection.severity import Name, of_finding
 from diagnostics import SensorLayout
 from diagnostics.preprocessing.levels import MAJORITY
 
 SCHEMA = "adaptfault.check/1"
+
+Level = Literal["full", "quick"]
+"""How much is tested."""
 
 _FIRST = 3  # frames of a recording from which its begin is taken
 _IN_CONTACT = 0.3  # of the median peak, as the begin of a contact event
@@ -60,6 +63,8 @@ class DataSetCheck:
         given: what the recordings were compared with.
         source: what the data set is called.
         naming: of its pads and recordings.
+        level: "full", or "quick" (:mod:`adaptfault.inspection.quick`).
+        left_to_check: what a quick check leaves to the full one.
     """
 
     inspection: Inspection
@@ -71,6 +76,8 @@ class DataSetCheck:
     given: frozenset[Need] = frozenset()
     source: str = ""
     naming: Naming = field(default_factory=Naming)
+    level: Level = "full"
+    left_to_check: tuple[Unchecked, ...] = ()
 
     @property
     def healthy_share(self) -> float:
@@ -142,6 +149,8 @@ class DataSetCheck:
 
     @property
     def _unchecked(self) -> tuple[Unchecked, ...]:
+        if self.level == "quick":
+            return self.left_to_check
         found = []
         coverage = self.inspection.diagnosis.coverage
         cells = int(self.layout.present.sum())
@@ -162,6 +171,7 @@ class DataSetCheck:
         """Return a JSON-safe dict."""
         return {
             "schema": SCHEMA,
+            "level": self.level,
             "severity": self.severity,
             "healthy_share": self.healthy_share,
             "findings": self.findings.to_dicts(),

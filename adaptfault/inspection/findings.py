@@ -14,8 +14,8 @@ from typing import Any, Literal, overload
 from adaptfault.inspection.code import LEVELS, NEEDS, PREFIX, Code, Need
 from adaptfault.inspection.code_list import CODES
 from adaptfault.inspection.codes import code_of
-from adaptfault.inspection.inspection import Finding
 from adaptfault.inspection.naming import Naming
+from adaptfault.inspection.result import Finding
 from adaptfault.inspection.severity import worst
 from diagnostics import SensorLayout
 from diagnostics.decision.numbering import Numbering

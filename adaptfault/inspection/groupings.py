@@ -17,7 +17,7 @@ from adaptfault.data.recordings import Opened
 from adaptfault.data.recordings.errors import InputError
 from adaptfault.data.recordings.facts.labels import table_lines
 from adaptfault.inspection.coincidence import coinciding
-from adaptfault.inspection.inspection import Finding
+from adaptfault.inspection.result import Finding
 from adaptfault.inspection.severity import of_finding
 from diagnostics import Diagnosis
 

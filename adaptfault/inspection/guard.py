@@ -10,8 +10,9 @@ from typing import Any
 from adaptfault.data.recordings import Opened, Recordings, open_recordings
 from adaptfault.inspection.check_log import check_log, classes_of
 from adaptfault.inspection.findings import FailOn, Findings, level_of
-from adaptfault.inspection.inspection import Finding, inspect
+from adaptfault.inspection.inspection import inspect
 from adaptfault.inspection.long_log import inspect_parts
+from adaptfault.inspection.result import Finding
 from diagnostics import SelfDiagnosis
 
 __all__ = ["GuardError", "guard"]

@@ -1,151 +1,31 @@
-"""Inspection of a log: everything that is told of it, each finding with a severity; the worst
-decides."""
+"""Inspection of a log: everything that is told of it."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
-from typing import Any
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from adaptfault.inspection.changed_readings import (
-    ChangedReadings,
-    find_changed_readings,
-    find_sensor_change,
-)
-from adaptfault.inspection.code import Code
-from adaptfault.inspection.codes import BY_NAME
+from adaptfault.inspection.changed_readings import ChangedReadings
 from adaptfault.inspection.coincidence import coinciding
 from adaptfault.inspection.converter_range import within_range
-from adaptfault.inspection.severity import Name, of_faults, of_finding, untested, worst
-from diagnostics import Diagnosis, Fault, FaultSet, SelfDiagnosis, SensorLayout
+from adaptfault.inspection.find_changes import find_changed_readings, find_sensor_change
+from adaptfault.inspection.result import Finding, Inspection, finding_of, of_diagnosis
+from diagnostics import Diagnosis, FaultSet, SelfDiagnosis, SensorLayout
 from diagnostics.diagnosis import checked_recordings
 from diagnostics.evidence.drift import GAIN
 from diagnostics.preprocessing.readings import RecordingBlocks
 from diagnostics.sensor.common_mode import CommonMode, find_common_mode
 from diagnostics.sensor.converter_change import find_converter_change
 from diagnostics.sensor.disturbance import Disturbance, find_disturbances, find_sentinel
-from diagnostics.sensor.recalibration import Recalibration
-from diagnostics.sensor.rewiring import Rewiring
 from diagnostics.sensor.sensor_change import SensorChange, amplification
 from diagnostics.sensor.shared import measured
-from diagnostics.shown import shown
-
-SCHEMA = "adaptfault.inspection/1"
-
-OF_FRAMES: Mapping[str, Name] = {
-    "frozen": "frozen",
-    "lost": "lost_frames",
-    "one_signal": "one_signal",
-    "corrupt_frame": "corrupt_frame",
-    "common_spike": "common_spike",
-    "repeated_frames": "repeated_frames",
-    "crosstalk": "crosstalk",
-}
-"""Names of the findings of each kind of transport fault."""
-
-OF_CELLS = ("fault", "wire", "static_load", *OF_FRAMES.values(), "held_value", "untested")
-"""Names of the findings that a diagnosis gives."""
 
 _OF_ALL_CELLS = ("quantised", "saturated", "normalised")
 
 _EXPLAIN_A_CHANGE = ("normalised", "ramp", "hum", "crosstalk")
-
-
-@dataclass(frozen=True)
-class Finding:
-    """One finding.
-
-    Attributes:
-        name: one of :data:`adaptfault.inspection.severity.NAMES`.
-        severity: 0 nothing to do, 1 watch, 2 a person is needed, 3 unknown.
-        reason: one sentence.
-        fault: of which it tells; None: of none.
-    """
-
-    name: Name
-    severity: int
-    reason: str
-    fault: Fault | None = field(default=None, repr=False)
-
-    @property
-    def code(self) -> Code:
-        """What is to say of each finding of this kind."""
-        return BY_NAME[self.name if self.fault is None else str(self.fault.kind)]
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return a JSON-safe dict."""
-        return {
-            "code": str(self.code),
-            "name": self.name,
-            "severity": self.severity,
-            "reason": self.reason,
-        }
-
-
-@shown
-@dataclass(frozen=True, eq=False)
-class Inspection:
-    """What a log tells about a sensor.
-
-    Attributes:
-        readings: of the log with wires and pads put back, and without what the cells share; their
-            diagnosis.
-        findings: in the order in which they are told.
-        change: of a pad, or of the whole sensor, against the reference; None where there is none.
-        common_mode: what the cells share, which the diagnosis does without; None where there is
-            nothing to take out.
-    """
-
-    readings: ChangedReadings
-    findings: tuple[Finding, ...]
-    change: SensorChange | None = None
-    common_mode: CommonMode | None = None
-
-    @property
-    def diagnosis(self) -> Diagnosis:
-        """Of the readings."""
-        return self.readings.diagnosis
-
-    @property
-    def rewiring(self) -> Rewiring | None:
-        """Rows, columns or pads that answer in each other's place; None where there are none."""
-        return self.readings.rewiring
-
-    @property
-    def recalibration(self) -> Recalibration | None:
-        """Gain and offset of replaced pads; None where none was replaced."""
-        return self.readings.recalibration
-
-    @property
-    def severity(self) -> int:
-        """The worst severity of all findings; 0 without any."""
-        return worst(self.findings)
-
-    def __str__(self) -> str:
-        lines = [f"{finding.name}: {finding.reason}" for finding in self.findings]
-        return "\n".join([str(self.diagnosis), *lines])
-
-    @property
-    def told(self) -> dict[str, Any]:
-        """What changed between cells and readings, JSON-safe."""
-        return {
-            "rewiring": list(self.readings.told["rewiring"]),
-            "replaced_pads": list(self.readings.told["replaced_pads"]),
-            "change": None if self.change is None else asdict(self.change),
-        }
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return a JSON-safe dict."""
-        return {
-            "schema": SCHEMA,
-            "severity": self.severity,
-            "findings": [finding.to_dict() for finding in self.findings],
-            **self.told,
-            "diagnosis": self.diagnosis.to_dict(),
-        }
 
 
 def inspect(
@@ -231,7 +111,9 @@ def inspect(
         *of_diagnosis(readings.diagnosis),
     ]
     if classes is not None:
-        findings += [_told("coincides", text) for text in coinciding(readings.diagnosis, classes)]
+        findings += [
+            finding_of("coincides", text) for text in coinciding(readings.diagnosis, classes)
+        ]
     return Inspection(readings, tuple(findings), change, common)
 
 
@@ -336,13 +218,13 @@ def _change(
 def _of_readings(readings: ChangedReadings) -> list[Finding]:
     """Return exchanged wires, or replaced pads."""
     if readings.another is not None:
-        return [_told("another_sensor", readings.another.reason)]
+        return [finding_of("another_sensor", readings.another.reason)]
     if readings.in_part is not None:
-        return [_told("swapped_in_part", readings.in_part.reason)]
+        return [finding_of("swapped_in_part", readings.in_part.reason)]
     if readings.rewiring is not None:
-        return [_told("rewired", readings.reason)]
+        return [finding_of("rewired", readings.reason)]
     if readings.recalibration is not None:
-        return [_told("replaced_pad", readings.reason)]
+        return [finding_of("replaced_pad", readings.reason)]
     return []
 
 
@@ -350,38 +232,11 @@ def _of_change(change: SensorChange | None) -> list[Finding]:
     """Return a change of gain, or else of offset."""
     if change is None:
         return []
-    return [_told("gain" if change.gain != 1.0 else "offset", change.reason)]
-
-
-def of_diagnosis(diagnosis: Diagnosis) -> list[Finding]:
-    """Return the faults, wires, static loads, lost frames, held values and what was not tested."""
-    severity = of_faults(diagnosis)
-    of_frames = [
-        _told(OF_FRAMES[one.kind], one.reason)
-        for one in diagnosis.transport
-        if one.kind in OF_FRAMES
-    ]
-    told = {one.reason for one in of_frames}
-    findings = [
-        Finding("fault" if f.line is None else "wire", severity, f.reason, f)
-        for f in diagnosis.faults
-        if f.reason not in told
-    ]
-    findings += [_told("static_load", load.reason) for load in diagnosis.static_loads]
-    findings += of_frames
-    findings += [_told("held_value", one.reason) for one in diagnosis.possible if one.recordings]
-    reason = untested(diagnosis)
-    if reason is not None:
-        findings.append(_told("untested", reason))
-    return findings
+    return [finding_of("gain" if change.gain != 1.0 else "offset", change.reason)]
 
 
 def _finding(disturbance: Disturbance) -> Finding:
-    return _told(disturbance.name, disturbance.reason)
-
-
-def _told(name: Name, reason: str) -> Finding:
-    return Finding(name, of_finding(name), reason)
+    return finding_of(disturbance.name, disturbance.reason)
 
 
 def _untold(log: list[NDArray[np.float64]], layout: SensorLayout) -> Diagnosis:

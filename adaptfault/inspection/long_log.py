@@ -10,7 +10,8 @@ from typing import Any
 from numpy.typing import ArrayLike, NDArray
 
 from adaptfault.inspection.changed_readings import ChangedReadings
-from adaptfault.inspection.inspection import OF_CELLS, Finding, Inspection, inspect, of_diagnosis
+from adaptfault.inspection.inspection import inspect
+from adaptfault.inspection.result import OF_CELLS, Finding, Inspection, of_diagnosis
 from diagnostics import Diagnosis, SelfDiagnosis
 from diagnostics.preprocessing.readings import RecordingBlocks
 from diagnostics.threads import one_thread

@@ -15,7 +15,7 @@ from typing import TypeVar
 from adaptfault.data.printable import printable
 from adaptfault.data.recordings import Opened, Recordings
 from adaptfault.data.recordings.formats.datasets.features import common_features
-from adaptfault.inspection.inspection import Finding, Inspection
+from adaptfault.inspection.result import Finding, Inspection
 from diagnostics import Diagnosis, Fault, SensorLayout
 from diagnostics.decision.static_load import StaticLoad
 from diagnostics.preprocessing.transport import TransportFault

@@ -18,10 +18,12 @@ from adaptfault.bundle.known_faults import KnownFaults
 from adaptfault.bundle.pointer import Pointer
 from adaptfault.bundle.signature import read_private_key
 from adaptfault.bundle.signing import sign_bundle
-from adaptfault.inspection.changed_readings import ChangedReadings, as_loads, find_sensor_change
+from adaptfault.inspection.changed_readings import ChangedReadings
+from adaptfault.inspection.find_changes import as_loads, doubt, find_sensor_change
 from adaptfault.inspection.incoming import IncomingRecording, incoming_recordings
-from adaptfault.inspection.inspection import Inspection, inspect
+from adaptfault.inspection.inspection import inspect
 from adaptfault.inspection.plausibility import contradiction
+from adaptfault.inspection.result import Inspection
 from adaptfault.inspection.severity import (
     UNKNOWN,
     UNREADABLE,
@@ -234,7 +236,7 @@ def _decide_readings(run: MaintenanceRun, changed: ChangedReadings) -> _Outcome:
     if _was_rolled_back(run, changed):
         why = "a version that undid it was rolled back before"
     elif judgement.better and not judgement.collapsed:
-        why = changed.doubt(run.robot.diagnoser)
+        why = doubt(changed, run.robot.diagnoser)
     if why is None:
         return _undone(renewed, changed, judgement)
     why = f"not undone: {why}"

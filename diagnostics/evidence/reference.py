@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,19 +20,16 @@ from diagnostics.evidence.usual_duplicates import UsualDuplicates
 from diagnostics.healthy.model import HealthyModel
 from diagnostics.healthy.tiled_model import fit_healthy_model
 from diagnostics.preprocessing.baseline import baseline
-from diagnostics.preprocessing.levels import MARGIN
 from diagnostics.preprocessing.noise import UsualNoise
 from diagnostics.preprocessing.offset import ReferenceOffset, highest_rests, levelled, levels
-from diagnostics.preprocessing.readings import SEGMENT, RecordingBlocks, spread
+from diagnostics.preprocessing.readings import SEGMENT, RecordingBlocks
 from diagnostics.preprocessing.scale import Scale
+from diagnostics.preprocessing.tolerance import TOLERANCE, converter_step, tolerance_of
 from diagnostics.preprocessing.transport import Patience
 from diagnostics.sensor.gain import UsualSizes
 
 if TYPE_CHECKING:
     from diagnostics.layout import SensorLayout
-
-# of full scale: half the range of a stuck cell's reading, the dither of a converter
-_TOLERANCE = 0.005
 
 
 @dataclass(frozen=True)
@@ -170,7 +167,7 @@ class Reference:
     def unknown(cls, layout: SensorLayout, rest: NDArray[np.float64] | None = None) -> Reference:
         """Return the defaults of a cold start: baselines ``rest`` (``[D]``; None: 0), no evidence
         from jumps."""
-        tolerance = _TOLERANCE * layout.full_scale
+        tolerance = TOLERANCE * layout.full_scale
         rest = np.zeros(layout.n_cells) if rest is None else rest
         scale = Scale(rest, 2 * tolerance, layout.full_scale)
         return cls(
@@ -201,21 +198,3 @@ def highest_reading(recordings: Sequence[NDArray[np.float64]], layout: SensorLay
     low, high = RecordingBlocks.of(recordings).extremes()
     moved = layout.present.ravel() & (high > low) & (high > 0)
     return float(high[moved].max()) if moved.any() else layout.full_scale
-
-
-def tolerance_of(recordings: Sequence[NDArray[np.float64]], layout: SensorLayout) -> float:
-    """Return the half range of a constant reading: 1.5 converter steps, within 0.5 to 1 % of full
-    scale."""
-    step = converter_step(recordings, layout)
-    return max(
-        _TOLERANCE * layout.full_scale, min(MARGIN * step, 2 * _TOLERANCE * layout.full_scale)
-    )
-
-
-def converter_step(recordings: Sequence[NDArray[Any]], layout: SensorLayout) -> float:
-    """Return the smallest difference of two readings, 0 without any."""
-    readings = RecordingBlocks.of(recordings)
-    sample = readings.thinned(spread(np.flatnonzero(layout.present)))
-    steps = np.diff(np.unique(sample[np.isfinite(sample)]))
-    steps = steps[steps > 1e-6 * layout.full_scale]  # smaller differences are rounding
-    return float(steps.min()) if len(steps) else 0.0

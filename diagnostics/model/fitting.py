@@ -14,7 +14,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from diagnostics.evidence.reference import converter_step, tolerance_of
 from diagnostics.layout import SensorLayout
 from diagnostics.model.conditional_mean import ConditionalMean, CrossFitted
 from diagnostics.model.groups import as_one_of, fit_groups
@@ -35,6 +34,7 @@ from diagnostics.model.symbols import (
 )
 from diagnostics.model.ways import WAYS
 from diagnostics.preprocessing.levels import FEWEST
+from diagnostics.preprocessing.tolerance import converter_step, tolerance_of
 
 _FOLDS = 4
 _HALVES = 2  # of the folds: networks and tables without each

@@ -6,9 +6,9 @@ from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import betaln, logit
 
 from diagnostics.preprocessing.levels import EXPECTED, EXPECTED_LATE
+from diagnostics.when.log_gamma import log_beta
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -80,13 +80,12 @@ class Loose:
         """Return the recordings that are likelier faulty, with the share that they are of all."""
         share = np.full(ratio.shape[1], EXPECTED_LATE)
         for _ in range(2):
-            states = np.asarray(ratio + logit(share) > 0)
+            states = np.asarray(ratio + np.log(share / (1 - share)) > 0)
             share = (states.sum(axis=0) + _SINGLE) / (self._n + _SINGLE + self._healthy)
         return states
 
     def prior(self, states: Mask) -> Floats:
         """Return the log prior of the recordings over that of none."""
         k = states.sum(axis=0)
-        of_these = betaln(_SINGLE + k, self._healthy + self._n - k)
-        found: Floats = of_these - betaln(_SINGLE, self._healthy + self._n)
-        return found
+        of_these = log_beta(_SINGLE + k, self._healthy + self._n - k)
+        return np.asarray(of_these - log_beta(_SINGLE, self._healthy + self._n))

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.special import expit
 
 from diagnostics.preprocessing.levels import CERTAIN_RATIO, FEWEST, MAJORITY, SUSPICIOUS
 from diagnostics.preprocessing.quantiles import known_quantile
@@ -78,7 +77,7 @@ class Held:
     @property
     def probability(self) -> Floats:
         """P(a cell is faulty in its recordings), ``[D]``."""
-        return expit(self.evidence)
+        return np.asarray(np.exp(-np.logaddexp(0.0, -self.evidence)))
 
     @property
     def certain(self) -> Mask:

@@ -11,10 +11,10 @@ from enum import IntEnum
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import gammaln
 
 from diagnostics.preprocessing.levels import EXPECTED, FEWEST, LEAST_LOADED, MAJORITY
 from diagnostics.when.chain import Course, Lasting, Loose
+from diagnostics.when.log_gamma import log_gamma
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -232,10 +232,10 @@ def _marginal(counts: Floats, prior: Floats) -> Floats:
     total = np.zeros(len(counts))
     of_unit, of_context, of_symbol = np.nonzero(counts)
     size = prior[of_context, of_symbol]
-    gained = gammaln(size + counts[of_unit, of_context, of_symbol]) - gammaln(size)
+    gained = log_gamma(size + counts[of_unit, of_context, of_symbol]) - log_gamma(size)
     np.add.at(total, of_unit, gained)
     sums = counts.sum(axis=2)
     of_unit, of_context = np.nonzero(sums)
     size = prior.sum(axis=1)[of_context]
-    np.add.at(total, of_unit, gammaln(size) - gammaln(size + sums[of_unit, of_context]))
+    np.add.at(total, of_unit, log_gamma(size) - log_gamma(size + sums[of_unit, of_context]))
     return total

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from adaptfault.data.recordings.valid import valid_masks
 from adaptfault.data.simulated_grasps import simulate
-from adaptfault.inspection.inspection import of_diagnosis
+from adaptfault.inspection.result import of_diagnosis
 from diagnostics import Diagnosis, Fault, FaultKind, SelfDiagnosis, SensorLayout, Verdict
 from diagnostics.decision.by_recording import with_recordings
 from diagnostics.when import Held

@@ -6,9 +6,9 @@ from conftest import without_calibration
 
 from adaptfault.data.simulated_grasps import simulate
 from diagnostics import Diagnosis, Fault, FaultKind, SelfDiagnosis, SensorLayout, Verdict, inject
-from diagnostics.evidence.reference import tolerance_of
 from diagnostics.healthy.reference_faults import find_reference_faults
 from diagnostics.preprocessing.readings import RecordingBlocks
+from diagnostics.preprocessing.tolerance import tolerance_of
 
 LAYOUT = SensorLayout(1, 8, 8)
 GRASPS = simulate(6, LAYOUT, n_frames=40, seed=2).frames

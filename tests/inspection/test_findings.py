@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from adaptfault.inspection.code import LEVELS
 from adaptfault.inspection.code_list import CODES
 from adaptfault.inspection.findings import FailOn, Findings, Unchecked, level_of
-from adaptfault.inspection.inspection import Finding
+from adaptfault.inspection.result import Finding
 from adaptfault.inspection.severity import NAMES, of_finding
 from diagnostics import Fault, FaultKind, SensorLayout
 from diagnostics.decision.numbering import Numbering

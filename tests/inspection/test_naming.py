@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 
 from adaptfault.data.recordings import open_recordings
 from adaptfault.inspection.changed_readings import ChangedReadings
-from adaptfault.inspection.inspection import Finding, Inspection
 from adaptfault.inspection.leave_out import LeaveOut
 from adaptfault.inspection.naming import Naming
+from adaptfault.inspection.result import Finding, Inspection
 from diagnostics import Diagnosis, Fault, Line, SensorLayout, Verdict
 
 LAYOUT = SensorLayout(2, 3, 4, full_scale=1.0, unit="V", rate=50.0)

@@ -5,9 +5,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from diagnostics import SensorLayout
-from diagnostics.evidence.reference import converter_step
 from diagnostics.model.record import record_of
 from diagnostics.model.rest import fit_rest, shortest
+from diagnostics.preprocessing.tolerance import converter_step
 
 PAD = np.repeat([0, 1], 12)
 

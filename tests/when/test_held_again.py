@@ -68,6 +68,17 @@ def test_a_cell_that_holds_a_value_in_some_recordings_is_suspect_there_alone(
         assert suspect[expected, cell].all()
 
 
+def test_what_differs_from_rest_by_the_noise_of_a_converter_is_no_held_value():
+    rng = np.random.default_rng(0)
+    counts = []
+    for _ in range(24):
+        frames = np.full((12, 20), 11.0) + rng.integers(-1, 2, 20)
+        noisy = rng.random(20) < 0.5
+        frames[:, noisy] += rng.integers(0, 2, (12, noisy.sum()))
+        counts.append(frames)
+    assert not again(counts).any()
+
+
 @pytest.fixture(scope="module")
 def log() -> list[np.ndarray]:
     """A dozen recordings, too few to be their own reference; a cell holds a value in the last."""

@@ -216,7 +216,6 @@ def _array(path: Path, column: Any, about: _Column, first: int) -> NDArray[Any]:
         InputError: a row holds another number of values than the first of the file.
     """
     pa = imported("pyarrow", path)
-    compute = imported("pyarrow.compute", path)
     rows = len(column)
     sizes = list(about.shape[1:])
     order = None
@@ -228,8 +227,7 @@ def _array(path: Path, column: Any, about: _Column, first: int) -> NDArray[Any]:
         elif isinstance(kind, pa.BaseExtensionType):
             column = column.storage
         elif pa.types.is_nested(kind):
-            counts = compute.list_value_length(column)
-            lengths = _numpy(pa, counts.fill_null(-1) if counts.null_count else counts)
+            lengths = _lengths(path, column)
             expected = math.prod(sizes) if order else sizes[0]
             wrong = np.flatnonzero(lengths != expected)
             if len(wrong):
@@ -249,6 +247,17 @@ def _array(path: Path, column: Any, about: _Column, first: int) -> NDArray[Any]:
         physical = [about.shape[1:][axis] for axis in stored]
         return values.reshape(rows, *physical).transpose(0, *(axis + 1 for axis in order))
     return values.reshape(rows, *about.shape[1:])
+
+
+def _lengths(path: Path, column: Any) -> NDArray[Any]:
+    """Return how many values each row of a column of lists has; -1: no list."""
+    pa = imported("pyarrow", path)
+    has_offsets = pa.types.is_list(column.type) or pa.types.is_large_list(column.type)
+    if has_offsets and not column.null_count:
+        return np.diff(_numpy(pa, column.offsets))
+    compute = imported("pyarrow.compute", path)  # slow to import, and rarely needed
+    counts = compute.list_value_length(column)
+    return _numpy(pa, counts.fill_null(-1) if counts.null_count else counts)
 
 
 def _numpy(pa: Any, column: Any) -> NDArray[Any]:

@@ -1,0 +1,141 @@
+"""A quick check finds what holds a value, calls no cell tested, and says what it leaves."""
+
+import json
+import subprocess
+import sys
+
+import jsonschema
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from adaptfault.cli import main
+from adaptfault.data.recordings import Recordings, save_npz
+from adaptfault.data.simulated_grasps import simulate
+from adaptfault.inspection.check_log import check_log
+from adaptfault.inspection.quick import quick
+from adaptfault.schemas import schema_of
+from diagnostics import SensorLayout, Verdict
+from diagnostics.preprocessing.readings import RecordingBlocks
+from diagnostics.when import Spans
+from diagnostics.when.together import Together
+
+LAYOUT = SensorLayout(1, 6, 6, full_scale=3.3, unit="V", rate=20.0)
+MIDDLE = LAYOUT.cell(0, 3, 3)
+
+
+@pytest.fixture(scope="module")
+def grasps() -> list[np.ndarray]:
+    frames = simulate(6, LAYOUT, n_frames=50, seed=3).frames
+    order = np.random.default_rng(0).permutation(len(frames))
+    return [np.asarray(frames[i], dtype=np.float32) for i in order]
+
+
+def changed(grasps: list[np.ndarray], where: slice, cell: int, values) -> list[np.ndarray]:
+    log = [one.copy() for one in grasps]
+    for one in log[where]:
+        one[:, cell] = values(len(one))
+    return log
+
+
+@pytest.mark.parametrize("where", [slice(None), slice(12, None), slice(14, 28)])
+def test_what_holds_a_value_in_some_recordings_is_found_and_nothing_is_called_alive(where, grasps):
+    log = changed(grasps, where, MIDDLE, lambda n: np.full(n, 1.1))
+    found = quick(Recordings(tuple(log), LAYOUT))
+    diagnosis = found.inspection.diagnosis
+    assert Verdict.ALIVE not in diagnosis.verdicts
+    if where == slice(None):  # it never works: the whole check finds it
+        assert not found.answers[MIDDLE]
+        assert any(f"never move ({LAYOUT.place(MIDDLE)}" in one.what for one in found.unchecked)
+    else:
+        assert set(diagnosis.fault_set) == {MIDDLE}
+        assert found.inspection.severity == 1
+        assert set(diagnosis.faults[0].recordings or ()) <= set(range(len(log))[where])
+
+
+def test_of_a_healthy_set_nothing_is_told_but_what_was_not_checked(grasps):
+    log = Recordings(tuple(grasps), LAYOUT)
+    found = quick(log)
+    assert (found.inspection.findings, found.answers.mean() > 0.8) == ((), True)
+    checked = check_log(log, found)
+    assert checked.to_dict()["level"] == "quick"
+    assert "was not tested" in checked.findings.unchecked[0].what
+    assert checked.badge().count("not tested")
+
+
+def test_a_cell_that_moves_by_itself_does_not_answer(grasps):
+    rng = np.random.default_rng(1)
+    log = changed(grasps, slice(None), MIDDLE, lambda n: 1 + 0.3 * rng.standard_normal(n))
+    found = quick(Recordings(tuple(log), LAYOUT))
+    assert not found.answers[MIDDLE]
+    told = next(one.what for one in found.unchecked if "not together" in one.what)
+    assert LAYOUT.place(MIDDLE) in told
+
+
+def test_where_hardly_a_cell_answers_the_set_does_not_pass():
+    rng = np.random.default_rng(0)
+    alone = [rng.uniform(0, 3, (50, 36)).astype(np.float32) for _ in range(8)]
+    (told,) = quick(Recordings(tuple(alone), LAYOUT)).inspection.findings
+    assert (told.name, told.severity) == ("untested", 1)
+
+
+@settings(max_examples=20, deadline=None)
+@given(cuts=st.sets(st.integers(1, 149)), missing=st.booleans(), seed=st.integers(0, 99))
+def test_how_a_set_is_cut_into_pieces_does_not_matter(cuts, missing, seed):
+    rng = np.random.default_rng(seed)
+    readings = rng.uniform(0, 3, (150, 36))
+    if missing:
+        readings[rng.random(readings.shape) < 0.1] = np.nan
+    lengths = [60, 50, 40]
+    ends = np.cumsum(lengths)
+    recordings = np.split(readings, ends[:-1])
+    pieces = np.split(readings, sorted(cuts | set(ends[:-1].tolist())))
+    sizes = list(map(len, pieces))
+    spans = Spans.of(RecordingBlocks(pieces)).whole(sizes, lengths)
+    expected = Spans.of(RecordingBlocks(recordings))
+    np.testing.assert_array_equal(spans.low, expected.low)
+    np.testing.assert_array_equal(spans.high, expected.high)
+    sums = Together.of(pieces, LAYOUT).whole(sizes, lengths).sums
+    np.testing.assert_allclose(sums, Together.of(recordings, LAYOUT).sums, rtol=1e-12)
+
+
+def test_the_correlation_is_that_with_the_mean_of_the_cells_beside(grasps):
+    together = Together.of(grasps[:2], LAYOUT)
+    beside = LAYOUT.beside[MIDDLE]
+    mean = grasps[1][:, beside[beside >= 0]].astype(np.float64).mean(axis=1)
+    expected = np.corrcoef(grasps[1][:, MIDDLE].astype(np.float64), mean)[0, 1]
+    np.testing.assert_allclose(together.correlation[1, MIDDLE], expected, rtol=1e-9)
+
+
+def test_the_command_says_its_level_and_waits_for_no_package_that_it_does_not_need(
+    grasps, tmp_path
+):
+    save_npz(tmp_path / "set.npz", Recordings(tuple(grasps), LAYOUT))
+    code = (
+        "import sys; from adaptfault.cli import main; code = main(sys.argv[1:]);"
+        "assert code == 0, code;"
+        "sys.exit(str({'pandas', 'scipy', 'sklearn', 'torch', 'tqdm'} & sys.modules.keys()))"
+    )
+    arguments = ["check", str(tmp_path / "set.npz"), "--quick"]
+    told = subprocess.run(
+        [sys.executable, "-c", code, *arguments], capture_output=True, text=True, check=False
+    )
+    assert "not checked: " in told.stdout
+    assert "without --quick" in told.stdout
+    assert told.stderr.splitlines()[-1] == "set()"
+
+
+def test_its_document_is_one_of_a_check_and_options_that_need_tested_cells_are_refused(
+    grasps, tmp_path, capsys
+):
+    log = changed(grasps, slice(12, None), MIDDLE, lambda n: np.full(n, 1.1))
+    save_npz(tmp_path / "set.npz", Recordings(tuple(log), LAYOUT))
+    arguments = ["check", str(tmp_path / "set.npz"), "--quick"]
+    assert main([*arguments, "--json"]) == 1
+    document = json.loads(capsys.readouterr().out)
+    jsonschema.validate(document, schema_of(document["schema"]))
+    assert document["level"] == "quick"
+    for name, value in (("--html", "page.html"), ("--write-valid", "v.npz"), ("--healthy", "0:4")):
+        assert main([*arguments, name, str(tmp_path / value)]) == 3
+        assert f"{name} needs tested cells" in capsys.readouterr().err

@@ -20,6 +20,8 @@ from adaptfault.cli.shared_options import (
 )
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from adaptfault.data.recordings import Opened, Recordings
     from adaptfault.inspection.data_set import DataSetCheck
     from adaptfault.inspection.findings import FailOn
@@ -46,6 +48,16 @@ class Check(Inspecting):
     quick: bool = option(
         "one pass over the readings, without a model of the cells: finds what holds a value in some"
         " recordings; no cell is tested"
+    )
+    shard: str | None = option(
+        "keep what one pass tells of the I-th of N parts of the recordings in the file of --out,"
+        " for --merge",
+        "I/N",
+    )
+    merge: bool = option("the paths are parts that --shard wrote: check them as one data set")
+    sample: int | None = option(
+        "check so many recordings, drawn at random, and say how many of all hold a fault at most",
+        "N",
     )
     groups: Read | None = option(
         "what else divides the recordings, with which a fault may coincide: CSV table with the"
@@ -80,14 +92,20 @@ class Check(Inspecting):
 
     def run(self) -> int:
         """Check a data set; the exit code says how bad it is."""
-        from adaptfault.inspection.check_log import check_log
         from adaptfault.inspection.findings import FailOn
+
+        fails = None if self.fail_on is None else FailOn.parse(self.fail_on)
+        if self.quick or self.shard or self.merge or self.sample is not None:
+            self.quick = True
+            return self._quick(fails)
+        return self._full(fails)
+
+    def _full(self, fails: FailOn | None) -> int:
+        """Check a data set with a model of its cells."""
+        from adaptfault.inspection.check_log import check_log
         from adaptfault.inspection.groupings import coincide, data_sets_of, read_groupings
         from adaptfault.inspection.naming import Naming
 
-        fails = None if self.fail_on is None else FailOn.parse(self.fail_on)
-        if self.quick:
-            return self._quick(fails)
         if self.write_valid:
             from adaptfault.data.recordings.valid import refuse_foreign
 
@@ -128,47 +146,79 @@ class Check(Inspecting):
         return code
 
     def _quick(self, fails: FailOn | None) -> int:
-        """Check a data set in one pass."""
-        from adaptfault.inspection.check_log import check_log, classes_of
+        """Check a data set in one pass, a part of it, or merged parts."""
         from adaptfault.inspection.groupings import coincide, data_sets_of, read_groupings
-        from adaptfault.inspection.naming import Naming
-        from adaptfault.inspection.quick import quick
+        from adaptfault.inspection.quick import quick, quick_check
+        from adaptfault.inspection.quick_statistics import Statistics
 
         self._refuse_beside_quick()
-        log = self.open(self.recordings)
-        self.say_inferred(log.inferred)
-        report_range(log)
-        groupings = dict(data_sets_of(log, self.recordings))
+        log: Opened | None = None
+        n_recordings = 0
+        groupings: dict[str, Sequence[str]] = {}
+        if self.merge:
+            statistics = Statistics.joined([Statistics.load(path) for path in self.recordings])
+        else:
+            whole = self.open(self.recordings)
+            self.say_inferred(whole.inferred)
+            log = self._part_of(whole)
+            n_recordings = len(whole)
+            statistics = Statistics.of(log, self.left_out)
+            report_range(log)
+            groupings |= data_sets_of(log, self.recordings)
+        if self.shard:
+            assert self.out is not None
+            statistics.save(self.out)
+            self.say(f"{len(statistics.naming.lengths)} recordings in {self.out}")
+            return 0
         if self.groups is not None:
-            groupings |= read_groupings(self.groups, log.names)
-        classes = classes_of(log)
-        found = quick(log, classes)
-        if classes is not None:
-            groupings["class"] = classes
+            groupings |= read_groupings(self.groups, statistics.naming.recordings)
+        found = quick(statistics)
+        if statistics.classes is not None:
+            groupings["class"] = statistics.classes
         also = coincide(found.inspection.diagnosis, groupings)
         findings = [
             replace(one, severity=self.untested_code) if one.name == "untested" else one
             for one in (*found.inspection.findings, *also)
         ]
         found = replace(found, inspection=replace(found.inspection, findings=tuple(findings)))
-        checked = check_log(
-            log,
-            found.named(Naming.of(log)),
-            left_out=self.left_out,
-            grouped=bool(groupings),
-            source=", ".join(self.recordings),
-        )
+        source = ", ".join(self.recordings)
+        checked = quick_check(statistics, found, log, grouped=bool(groupings), source=source)
         code = checked.severity if fails is None else checked.findings.failed(fails)
-        _write(self, log, checked, code, [])
-        self._tell(checked, [])
+        notes = []
+        if self.sample is not None and log is not None:
+            from adaptfault.inspection.sample_bound import bound_of_sample
+
+            notes.append(bound_of_sample(found.inspection.diagnosis, n_recordings))
+        _write_result(self, checked)
+        self._tell(checked, notes)
         return code
 
+    def _part_of(self, log: Opened) -> Opened:
+        """Return the recordings of a shard, or of a sample."""
+        if self.shard:
+            number, of = _shard(self.shard)
+            ends = [len(log) * i // of for i in (number - 1, number)]
+            if ends[0] == ends[1]:
+                raise ValueError(f"--shard {self.shard}: the data set has {len(log)} recordings")
+            return log.select(range(*ends))
+        if self.sample is not None and self.sample < len(log):
+            import random
+
+            return log.select(random.Random(0).sample(range(len(log)), self.sample))
+        return log
+
     def _refuse_beside_quick(self) -> None:
-        """Raise ValueError where an option needs tested cells."""
+        """Raise ValueError where options cannot be meant together."""
         for name in ("reference", "healthy", "html", "write_valid", "write_copy"):
             if getattr(self, name):
                 typed = "--" + name.replace("_", "-")
                 raise ValueError(f"{typed} needs tested cells: leave out --quick")
+        if self.shard and not self.out:
+            raise ValueError("--shard needs --out PART, the file for --merge")
+        if self.sample is not None and self.sample < 1:
+            raise ValueError(f"--sample {self.sample}: expected 1 recording or more")
+        if sum(map(bool, (self.shard, self.merge, self.sample))) > 1:
+            raise ValueError("--shard, --merge and --sample: give one of them")
 
     def _tell(self, checked: DataSetCheck, notes: list[str]) -> None:
         """Print the result in the form that was asked for."""
@@ -182,7 +232,7 @@ class Check(Inspecting):
         elif self.format == "markdown":
             text = findings.markdown(numbering, checked.advice)
         elif self.quick:
-            told = numbering.text("\n".join([*map(str, checked.advice), str(findings)]))
+            told = numbering.text("\n".join([*notes, *checked.advice, str(findings)]))
             text = f"{numbering.text(checked.naming.text(str(checked.summary)))}\n\n{told}"
         else:
             say = checked.naming.text
@@ -205,6 +255,14 @@ class Check(Inspecting):
 add = Check.add
 
 
+def _shard(text: str) -> tuple[int, int]:
+    """Return the number of a part, from 1, and how many there are."""
+    number, _, of = text.partition("/")
+    if not (number.isdigit() and of.isdigit() and 0 < int(number) <= int(of)):
+        raise ValueError(f"--shard {text}: expected I/N, as 1/8 for the first of eight parts")
+    return int(number), int(of)
+
+
 def _part(text: str, log: Opened) -> Recordings:
     """Return the recordings that are known to be healthy."""
     from adaptfault.data.recordings import Recordings
@@ -222,14 +280,19 @@ def _part(text: str, log: Opened) -> Recordings:
     return Recordings(frames, log.layout, names=log.names[begin:end])
 
 
-def _write(args: Check, log: Opened, checked: DataSetCheck, code: int, notes: list[str]) -> None:
+def _write_result(args: Check, checked: DataSetCheck) -> None:
+    """Write the result and the badge."""
     from adaptfault.data.atomic import atomic_write
 
-    diagnosis = checked.inspection.diagnosis
     if args.out:
         atomic_write(args.out, json.dumps(checked.to_dict(), allow_nan=False).encode())
     if args.badge:
         atomic_write(args.badge, checked.badge().encode())
+
+
+def _write(args: Check, log: Opened, checked: DataSetCheck, code: int, notes: list[str]) -> None:
+    diagnosis = checked.inspection.diagnosis
+    _write_result(args, checked)
     compared = bool(args.reference or args.healthy)
     write_page(args, diagnosis, code, notes, compared=compared, of_a_data_set=True)
     if args.write_valid:

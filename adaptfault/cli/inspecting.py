@@ -127,8 +127,8 @@ def _inspected(
     """Inspect a log, as the version of the bundle that runs reads it."""
     from adaptfault.data.recordings.check import check_scale
     from adaptfault.data.recordings.doubts import copies
-    from adaptfault.inspection.check_log import classes_of
     from adaptfault.inspection.long_log import inspect_parts
+    from adaptfault.inspection.naming import classes_of
     from diagnostics import SelfDiagnosis
 
     is_known = diagnoser is not None

@@ -12,17 +12,16 @@ from adaptfault.data.recordings.facts.rates import Clock
 from adaptfault.data.recordings.load import PART
 from adaptfault.data.summary import summary_of
 from adaptfault.inspection.code import Need
-from adaptfault.inspection.data_set import DataSetCheck, Level, starts_and_tares
-from adaptfault.inspection.findings import Unchecked
+from adaptfault.inspection.data_set import DataSetCheck, starts_and_tares
 from adaptfault.inspection.naming import Naming
-from adaptfault.inspection.quick import Quick
 from adaptfault.inspection.result import Inspection
 from diagnostics.preprocessing.readings import RecordingBlocks
+from diagnostics.sensor.shared import measured
 
 
 def check_log(
     log: Opened | Recordings,
-    inspection: Inspection | Quick,
+    inspection: Inspection,
     *,
     left_out: int = 0,
     compared: bool = False,
@@ -33,26 +32,14 @@ def check_log(
 
     Args:
         log: the data set.
-        inspection: of its recordings, with their classes; or what a quick check tells of them.
+        inspection: of its recordings, with their classes.
         left_out: recordings and files that could not be read.
         compared: whether the inspection had healthy recordings to compare with.
         grouped: whether anything else than classes divides the recordings.
         source: what the data set is called.
     """
 
-    left_to_check: tuple[Unchecked, ...] = ()
-    level: Level = "full"
-    if isinstance(inspection, Quick):
-        level = "quick"
-        left_to_check = inspection.unchecked
-        inspection = inspection.inspection
-
     def recordings() -> Iterator[NDArray[Any]]:
-        if level == "quick":
-            yield from log
-            return
-        from diagnostics.sensor.shared import measured  # slow to import
-
         for frames in log:
             yield from measured(RecordingBlocks([frames]), log.layout)
 
@@ -78,13 +65,4 @@ def check_log(
         frozenset(given),
         source,
         naming,
-        level,
-        left_to_check,
     )
-
-
-def classes_of(log: Opened | Recordings) -> list[str] | None:
-    """Return the name of the class of each recording; None where they have none."""
-    if log.labels is None:
-        return None
-    return [log.class_names[label] if log.class_names else str(label) for label in log.labels]

@@ -8,10 +8,11 @@ from os import PathLike, fspath
 from typing import Any
 
 from adaptfault.data.recordings import Opened, Recordings, open_recordings
-from adaptfault.inspection.check_log import check_log, classes_of
+from adaptfault.inspection.check_log import check_log
 from adaptfault.inspection.findings import FailOn, Findings, level_of
 from adaptfault.inspection.inspection import inspect
 from adaptfault.inspection.long_log import inspect_parts
+from adaptfault.inspection.naming import classes_of
 from adaptfault.inspection.result import Finding
 from diagnostics import SelfDiagnosis
 

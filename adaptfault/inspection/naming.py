@@ -150,6 +150,13 @@ class Naming:
         return re.sub(r"\d+", lambda number: names[int(number[0])], numbers)
 
 
+def classes_of(log: Opened | Recordings) -> list[str] | None:
+    """Return the name of the class of each recording; None where they have none."""
+    if log.labels is None:
+        return None
+    return [log.class_names[label] if log.class_names else str(label) for label in log.labels]
+
+
 def _reasons(diagnosis: Diagnosis) -> list[str]:
     """Return the sentences of a diagnosis that are findings."""
     faults = [one.reason for one in diagnosis.faults]

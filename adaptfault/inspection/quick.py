@@ -6,7 +6,7 @@ of a data set nor how it is cut matters.
 
 Found are cells and wires that hold a value in some recordings although those beside them move
 (:mod:`diagnostics.when`), as the whole check finds them. No cell is called ALIVE: that a cell
-answers together with those beside it (:mod:`diagnostics.when.together`) is a witness of contact,
+answers together with those beside it (:mod:`diagnostics.when.together`) shows contact, and is
 no test of what it reads. What only the whole check tells is listed as not checked.
 
 Not detected: cells that are dead from the first recording to the last, that move by themselves,
@@ -15,14 +15,16 @@ late, in part, or as another one does, drift and noise, and what the whole array
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
+from adaptfault.data.recordings.facts.rates import Clock
 from adaptfault.inspection.changed_readings import ChangedReadings
+from adaptfault.inspection.code import Need
+from adaptfault.inspection.data_set import DataSetCheck, starts_and_tares
 from adaptfault.inspection.findings import Unchecked
 from adaptfault.inspection.result import Inspection, faults_and_frames, finding_of
 from adaptfault.inspection.severity import UNTESTED
@@ -31,15 +33,14 @@ from diagnostics.decision.by_recording import with_recordings
 from diagnostics.preprocessing.load import LoadDirection
 from diagnostics.preprocessing.readings import RecordingBlocks
 from diagnostics.preprocessing.tolerance import tolerance_of
-from diagnostics.sensor.repeated_frames import find_repeated_frames
-from diagnostics.when import Spans, find_held
-from diagnostics.when.together import Together
+from diagnostics.when import find_held
 
 if TYPE_CHECKING:
     from adaptfault.data.recordings import Opened, Recordings
-    from adaptfault.inspection.naming import Naming
+    from adaptfault.inspection.quick_statistics import Statistics
 
 _LISTED = 5
+_OF_FRAMES = "begins and tares in contact, and times: parts that are merged do not hold them"
 
 Bools = NDArray[np.bool_]
 
@@ -57,10 +58,6 @@ class Quick:
     inspection: Inspection
     answers: Bools
     moves: Bools
-
-    def named(self, naming: Naming) -> Quick:
-        """Return the same with pads and recordings called by their names."""
-        return replace(self, inspection=naming.of_inspection(self.inspection))
 
     @property
     def unchecked(self) -> tuple[Unchecked, ...]:
@@ -88,36 +85,44 @@ class Quick:
         return tuple(found)
 
 
-def quick(log: Opened | Recordings, classes: Sequence[str] | None = None) -> Quick:
-    """Return what one pass over a data set tells.
+def quick(statistics: Statistics) -> Quick:
+    """Return what one pass over a data set tells, of which these are the statistics."""
+    layout = statistics.layout
+    planes = layout
+    order = np.arange(layout.n_cells)
+    if layout.axes > 1:
+        from diagnostics.diagnosis import axis_planes  # slow to import, and rarely needed
 
-    Args:
-        log: the data set.
-        classes: the class of each recording; None: unknown.
-    """
-    layout = log.layout
-    pass_ = _Pass(layout)
-    for part in _parts(log):
-        pass_.add(part)
-    lengths = _lengths(log)
-    spans = pass_.spans(lengths)
-    held = find_held(spans, pass_.planes, pass_.tolerance, classes).of(pass_.place)
-    nothing = Diagnosis(
+        planes, order = axis_planes(layout)
+    place = np.argsort(order)
+    sample = RecordingBlocks([frames[:, order] for frames in statistics.sample])
+    tolerance = tolerance_of(sample, planes)
+    spans = statistics.spans.of_cells(order)
+    load = LoadDirection.fit(sample, planes)
+    if load is not None:
+        spans = spans.loads(load)
+    lengths = statistics.naming.lengths
+    held = find_held(spans, planes, tolerance, statistics.classes)
+    if load is not None:
+        held = replace(held, value=load.readings(held.value, np.zeros(len(place), bool)))
+    held = held.of(place)
+    diagnosis = Diagnosis(
         layout=layout,
         faults=(),
         probability=np.zeros(layout.n_cells),
         tested=np.zeros(layout.n_cells, bool),
         n_frames=sum(lengths),
         n_recordings=len(lengths),
-        transport=pass_.repeated,
+        transport=_transport(statistics),
     )
-    diagnosis = with_recordings(nothing, held, lengths, pass_.tolerance, None)
-    together = pass_.together(lengths)
-    answers = together.answers(spans)[pass_.place]
-    moves = np.asarray(together.moves(spans).any(axis=0))[pass_.place]
-    findings = faults_and_frames(diagnosis)
+    if len(lengths) > 1:
+        diagnosis = with_recordings(diagnosis, held, lengths, tolerance, None)
+    together = statistics.together.of_cells(order)
     present = layout.present.ravel()
-    known = (answers | diagnosis.fault_set.mask) & present
+    answers = together.answers(spans)[place] & present
+    moves = np.asarray(together.moves(spans).any(axis=0))[place] & present
+    findings = faults_and_frames(diagnosis)
+    known = answers | diagnosis.fault_set.mask & present
     if known.sum() < UNTESTED * present.sum():
         text = (
             f"only {known.sum()} of {present.sum()} cells answer together with those beside them,"
@@ -125,69 +130,63 @@ def quick(log: Opened | Recordings, classes: Sequence[str] | None = None) -> Qui
         )
         findings.append(finding_of("untested", text))
     readings = ChangedReadings(None, None, [], diagnosis)
-    return Quick(Inspection(readings, tuple(findings)), answers & present, moves & present)
+    return Quick(Inspection(readings, tuple(findings)), answers, moves)
 
 
-class _Pass:
-    """One pass over a data set, part by part; the first part tells the direction of load, the step
-    of the converter, and whether frames repeat."""
+def quick_check(
+    statistics: Statistics,
+    found: Quick,
+    log: Opened | Recordings | None,
+    *,
+    grouped: bool = False,
+    source: str = "",
+) -> DataSetCheck:
+    """Return the health of a data set, from a quick check of it.
 
-    def __init__(self, layout: SensorLayout) -> None:
-        self.layout = layout
-        self.planes = layout
-        order = np.arange(layout.n_cells)
-        if layout.axes > 1:
-            from diagnostics.diagnosis import axis_planes  # slow to import, and rarely needed
-
-            self.planes, order = axis_planes(layout)
-        self.order = order
-        self.place = np.argsort(order)
-        self.tolerance = 0.0
-        self.repeated: tuple[TransportFault, ...] = ()
-        self._load: LoadDirection | None = None
-        self._pieces: list[int] = []
-        self._spans: list[Spans] = []
-        self._together: list[Together] = []
-
-    def add(self, part: list[NDArray[Any]]) -> None:
-        """Take in recordings ``[T, D]``, or pieces of them."""
-        if not self._pieces:
-            self._begin(part)
-        valid = RecordingBlocks(part).valid(self.layout.full_scale, self.layout.present.ravel())
-        given = [np.asarray(frames, np.float64)[:, self.order] for frames in valid.given]
-        if self._load is not None:
-            given = [self._load.loads(frames) for frames in given]
-        self._pieces += map(len, given)
-        self._spans.append(Spans.of(RecordingBlocks(given)))
-        self._together.append(Together.of(given, self.planes))
-
-    def _begin(self, part: list[NDArray[Any]]) -> None:
-        log = RecordingBlocks(part)
-        self.tolerance = tolerance_of(log, self.layout)
-        self._load = LoadDirection.fit(log, self.planes)
-        repeated = find_repeated_frames(part, self.layout)
-        if repeated is not None:
-            text = repeated.reason(self.layout.rate)
-            self.repeated = (TransportFault("repeated_frames", 0, 1, text),)
-
-    def spans(self, lengths: Sequence[int]) -> Spans:
-        """Return the ranges of whole recordings of these lengths."""
-        return Spans.joined(self._spans).whole(self._pieces, lengths)
-
-    def together(self, lengths: Sequence[int]) -> Together:
-        """Return the sums of whole recordings of these lengths."""
-        return Together.joined(self._together).whole(self._pieces, lengths)
+    Args:
+        statistics: of its recordings.
+        found: from them.
+        log: the data set; None: merged parts, of which begins and times are not known.
+        grouped: whether anything else than classes divides the recordings.
+        source: what the data set is called.
+    """
+    begun: tuple[str, ...] = ()
+    tared: tuple[str, ...] = ()
+    clock = Clock()
+    left = found.unchecked
+    naming = statistics.naming
+    if log is not None:
+        begun, tared = starts_and_tares(lambda: iter(log), log.names, log.layout)
+        clock = getattr(log, "clock", clock)
+    else:
+        left += (Unchecked(_OF_FRAMES, ("TOUCH-162", "TOUCH-163")),)
+    given: set[Need] = set()
+    if clock.jitter is not None:
+        given.add("times")
+    if statistics.classes is not None or grouped:
+        given.add("classes")
+    return DataSetCheck(
+        naming.of_inspection(found.inspection),
+        statistics.summary,
+        clock,
+        statistics.left_out,
+        begun,
+        tared,
+        frozenset(given),
+        source,
+        naming,
+        "quick",
+        left,
+    )
 
 
-def _parts(log: Opened | Recordings) -> Any:
-    """Return the recordings in parts that fit into memory."""
-    frames = getattr(log, "frames", None)
-    return [list(frames)] if frames is not None else log.parts()  # type: ignore[union-attr]
-
-
-def _lengths(log: Opened | Recordings) -> list[int]:
-    frames = getattr(log, "frames", None)
-    return list(map(len, frames)) if frames is not None else list(log.lengths)  # type: ignore[union-attr]
+def _transport(statistics: Statistics) -> tuple[TransportFault, ...]:
+    """Return that frames repeat, where they do."""
+    repeated = statistics.repetitions.told
+    if repeated is None:
+        return ()
+    text = repeated.reason(statistics.layout.rate)
+    return (TransportFault("repeated_frames", 0, statistics.repetitions.repeated, text),)
 
 
 def _places(cells: NDArray[np.intp], layout: SensorLayout) -> str:

@@ -46,6 +46,49 @@ class RepeatedFrames:
         )
 
 
+@dataclass(frozen=True)
+class Repetitions:
+    """How often frames repeat, counted; what several recordings have is the sum.
+
+    Attributes:
+        frames: number of frames.
+        repeated: those that equal the one before.
+        between: int ``[1025]``, how often a new frame came so many frames after the last new one.
+    """
+
+    frames: int
+    repeated: int
+    between: NDArray[np.intp]
+
+    @classmethod
+    def of(cls, frames: NDArray[Any]) -> Repetitions:
+        """Return those of one recording, ``[T, D]``."""
+        again = repetitions(frames)
+        between = np.minimum(np.diff(np.flatnonzero(again == 0)), _FRAMES)
+        counts = np.bincount(between, minlength=_FRAMES + 1)
+        return cls(len(frames), int((again > 0).sum()), counts)
+
+    @classmethod
+    def joined(cls, parts: Sequence[Repetitions]) -> Repetitions:
+        """Return the sum."""
+        between = np.sum([part.between for part in parts], axis=0)
+        frames = sum(part.frames for part in parts)
+        return cls(frames, sum(part.repeated for part in parts), between)
+
+    @property
+    def told(self) -> RepeatedFrames | None:
+        """How frames repeat; None where most are new, or hardly anything changes."""
+        came = np.cumsum(self.between)
+        if came[-1] < _FEWEST:
+            return None
+        share = self.repeated / self.frames
+        lower, upper = np.searchsorted(came, ((came[-1] + 1) // 2, came[-1] // 2 + 1))
+        every = float(lower + upper) / 2
+        if share < MAJORITY or every < 2:
+            return None
+        return RepeatedFrames(share, every)
+
+
 def find_repeated_frames(
     recordings: Sequence[NDArray[Any]], layout: SensorLayout
 ) -> RepeatedFrames | None:
@@ -53,14 +96,6 @@ def find_repeated_frames(
     anything changes."""
     present = layout.present.ravel()
     step = max(1, len(recordings) // _RECORDINGS)
-    some = [np.asarray(frames)[:_FRAMES] for frames in recordings[::step]]
-    again = [repetitions(frames[:, present]) for frames in some if len(frames)]
-    distances = [np.diff(np.flatnonzero(times == 0)) for times in again]
-    between = np.concatenate([*distances, np.zeros(0, np.intp)])
-    if len(between) < _FEWEST:
-        return None
-    share = float((np.concatenate(again) > 0).mean())
-    every = float(np.median(between))
-    if share < MAJORITY or every < 2:
-        return None
-    return RepeatedFrames(share, every)
+    some = [np.asarray(frames)[:_FRAMES, present] for frames in recordings[::step]]
+    counted = [Repetitions.of(frames) for frames in some if len(frames)]
+    return Repetitions.joined(counted).told if counted else None

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from diagnostics.preprocessing.load import LoadDirection
 from diagnostics.preprocessing.readings import RecordingBlocks
 
 Floats = NDArray[np.float64]
@@ -49,6 +50,18 @@ class Spans:
         ends = np.cumsum(pieces)
         begins = np.searchsorted(ends, np.cumsum(lengths) - np.array(lengths), side="right")
         return Spans(np.fmin.reduceat(self.low, begins), np.fmax.reduceat(self.high, begins))
+
+    def loads(self, load: LoadDirection) -> Spans:
+        """Return the spans of the loads; of cells that rest in the middle and pass it, from 0."""
+        if load.direction == "high":
+            return Spans(load.full_scale - self.high, load.full_scale - self.low)
+        ends = np.stack([np.abs(self.low - load.rest), np.abs(self.high - load.rest)])
+        passes = (self.low <= load.rest) & (self.high >= load.rest)
+        return Spans(np.where(passes, 0.0, ends.min(axis=0)), ends.max(axis=0))
+
+    def of_cells(self, cells: NDArray[np.intp]) -> Spans:
+        """Return the spans of some cells."""
+        return Spans(self.low[:, cells], self.high[:, cells])
 
     def __len__(self) -> int:
         return len(self.low)

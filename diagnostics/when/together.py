@@ -5,7 +5,7 @@ over the frames. A cell **answers** where it moves by 5 % of the usual range and
 at least 0.5. It answers in a log where it does so in three recordings, and in most of those in
 which it moves.
 
-That is a witness of contact; no proof that a cell measures it rightly. Not detected: cells that are
+That shows contact; it is no proof that a cell measures it rightly. Not detected: cells that are
 late by little, copy another one, read a part of their load, are clamped, noisy or drift, or fail
 now and then.
 """
@@ -70,6 +70,10 @@ class Together:
         ends = np.cumsum(pieces)
         begins = np.searchsorted(ends, np.cumsum(lengths) - np.array(lengths), side="right")
         return Together(np.add.reduceat(self.sums, begins, axis=1))
+
+    def of_cells(self, cells: NDArray[np.intp]) -> Together:
+        """Return the sums of some cells."""
+        return Together(self.sums[:, :, cells])
 
     @property
     def correlation(self) -> Floats:

@@ -1,20 +1,24 @@
 """A quick check finds what holds a value, calls no cell tested, and says what it leaves."""
 
 import json
+import re
 import subprocess
 import sys
+from itertools import pairwise
 
 import jsonschema
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.stats import hypergeom
 
 from adaptfault.cli import main
 from adaptfault.data.recordings import Recordings, save_npz
 from adaptfault.data.simulated_grasps import simulate
-from adaptfault.inspection.check_log import check_log
-from adaptfault.inspection.quick import quick
+from adaptfault.inspection.quick import quick, quick_check
+from adaptfault.inspection.quick_statistics import Statistics
+from adaptfault.inspection.sample_bound import most_faulty
 from adaptfault.schemas import schema_of
 from diagnostics import SensorLayout, Verdict
 from diagnostics.preprocessing.readings import RecordingBlocks
@@ -42,7 +46,7 @@ def changed(grasps: list[np.ndarray], where: slice, cell: int, values) -> list[n
 @pytest.mark.parametrize("where", [slice(None), slice(12, None), slice(14, 28)])
 def test_what_holds_a_value_in_some_recordings_is_found_and_nothing_is_called_alive(where, grasps):
     log = changed(grasps, where, MIDDLE, lambda n: np.full(n, 1.1))
-    found = quick(Recordings(tuple(log), LAYOUT))
+    found = quick(Statistics.of(Recordings(tuple(log), LAYOUT)))
     diagnosis = found.inspection.diagnosis
     assert Verdict.ALIVE not in diagnosis.verdicts
     if where == slice(None):  # it never works: the whole check finds it
@@ -56,9 +60,10 @@ def test_what_holds_a_value_in_some_recordings_is_found_and_nothing_is_called_al
 
 def test_of_a_healthy_set_nothing_is_told_but_what_was_not_checked(grasps):
     log = Recordings(tuple(grasps), LAYOUT)
-    found = quick(log)
+    statistics = Statistics.of(log)
+    found = quick(statistics)
     assert (found.inspection.findings, found.answers.mean() > 0.8) == ((), True)
-    checked = check_log(log, found)
+    checked = quick_check(statistics, found, log)
     assert checked.to_dict()["level"] == "quick"
     assert "was not tested" in checked.findings.unchecked[0].what
     assert checked.badge().count("not tested")
@@ -67,7 +72,7 @@ def test_of_a_healthy_set_nothing_is_told_but_what_was_not_checked(grasps):
 def test_a_cell_that_moves_by_itself_does_not_answer(grasps):
     rng = np.random.default_rng(1)
     log = changed(grasps, slice(None), MIDDLE, lambda n: 1 + 0.3 * rng.standard_normal(n))
-    found = quick(Recordings(tuple(log), LAYOUT))
+    found = quick(Statistics.of(Recordings(tuple(log), LAYOUT)))
     assert not found.answers[MIDDLE]
     told = next(one.what for one in found.unchecked if "not together" in one.what)
     assert LAYOUT.place(MIDDLE) in told
@@ -76,7 +81,7 @@ def test_a_cell_that_moves_by_itself_does_not_answer(grasps):
 def test_where_hardly_a_cell_answers_the_set_does_not_pass():
     rng = np.random.default_rng(0)
     alone = [rng.uniform(0, 3, (50, 36)).astype(np.float32) for _ in range(8)]
-    (told,) = quick(Recordings(tuple(alone), LAYOUT)).inspection.findings
+    (told,) = quick(Statistics.of(Recordings(tuple(alone), LAYOUT))).inspection.findings
     assert (told.name, told.severity) == ("untested", 1)
 
 
@@ -139,3 +144,76 @@ def test_its_document_is_one_of_a_check_and_options_that_need_tested_cells_are_r
     for name, value in (("--html", "page.html"), ("--write-valid", "v.npz"), ("--healthy", "0:4")):
         assert main([*arguments, name, str(tmp_path / value)]) == 3
         assert f"{name} needs tested cells" in capsys.readouterr().err
+
+
+@pytest.fixture
+def stored(grasps, tmp_path):
+    """A data set whose cell fails in the middle."""
+    log = changed(grasps, slice(12, None), MIDDLE, lambda n: np.full(n, 1.1))
+    labels = np.arange(len(log)) % 2
+    save_npz(tmp_path / "set.npz", Recordings(tuple(log), LAYOUT, labels, ("pick", "place")))
+    return tmp_path / "set.npz"
+
+
+@settings(max_examples=10, deadline=None)
+@given(cuts=st.sets(st.integers(1, 35), max_size=6))
+def test_the_verdict_of_merged_parts_is_that_of_the_whole(cuts, grasps):
+    log = changed(grasps, slice(14, 20), MIDDLE, lambda n: np.full(n, 1.1))
+    names = tuple(f"recording {i}" for i in range(len(log)))
+    whole = Statistics.of(Recordings(tuple(log), LAYOUT, names=names))
+    ends = [0, *sorted(cut for cut in cuts if cut < len(log)), len(log)]
+    parts = [
+        Statistics.of(Recordings(tuple(log[a:b]), LAYOUT, names=names[a:b]))
+        for a, b in pairwise(ends)
+    ]
+    merged = Statistics.joined(parts)
+    assert quick(whole).inspection.diagnosis.fault_set == {MIDDLE}
+    assert quick(merged).inspection.to_dict() == quick(whole).inspection.to_dict()
+    assert merged.summary.to_dict() == whole.summary.to_dict()
+
+
+def test_parts_that_are_written_and_merged_say_what_the_whole_says(stored, tmp_path, capsys):
+    assert main(["check", str(stored), "--quick", "--json"]) == 1
+    whole = json.loads(capsys.readouterr().out)
+    parts = [str(tmp_path / f"{i}.npz") for i in (1, 2, 3)]
+    for i, part in enumerate(parts, 1):
+        assert main(["check", str(stored), "--shard", f"{i}/3", "--out", part]) == 0
+    capsys.readouterr()
+    assert main(["check", "--merge", *parts, "--json"]) == 1
+    merged = json.loads(capsys.readouterr().out)
+    jsonschema.validate(merged, schema_of(merged["schema"]))
+    assert merged["inspection"] == whole["inspection"]
+    left = [one["what"] for one in merged["not_checked"]]
+    assert any("parts that are merged do not hold them" in what for what in left)
+
+
+def test_what_is_no_part_or_of_another_array_is_refused(stored, tmp_path, capsys):
+    part = str(tmp_path / "part.npz")
+    assert main(["check", str(stored), "--shard", "1/2", "--out", part]) == 0
+    other = str(tmp_path / "other.npz")
+    assert main(["check", str(stored), "--full-scale", "5", "--shard", "1/2", "--out", other]) == 0
+    capsys.readouterr()
+    assert main(["check", "--merge", str(stored), part]) == 3
+    assert "is no part of a check" in capsys.readouterr().err
+    assert main(["check", "--merge", part, other]) == 3
+    assert "not of one array" in capsys.readouterr().err
+    for arguments in (["--shard", "3/2", "--out", other], ["--shard", "1/2"], ["--sample", "0"]):
+        assert main(["check", str(stored), *arguments]) == 3
+        assert "--shard" in (told := capsys.readouterr().err) or "--sample" in told
+
+
+def test_a_sample_says_how_many_recordings_hold_a_fault_at_most(stored, capsys):
+    assert main(["check", str(stored), "--sample", "20"]) in (0, 1)
+    told = capsys.readouterr().out
+    assert re.search(r"in \d+ of 20 recordings drawn from \d+: with 95% confidence", told)
+
+
+@given(of=st.integers(1, 60), data=st.data())
+def test_the_bound_of_a_sample_is_the_largest_number_that_is_not_refuted(of, data):
+    drawn = data.draw(st.integers(1, of))
+    found = data.draw(st.integers(0, drawn))
+    most = most_faulty(found, drawn, of)
+    assert found <= most <= of - (drawn - found)
+    assert most == found or hypergeom.cdf(found, of, most, drawn) > 0.05 - 1e-9
+    if most < of - (drawn - found):
+        assert hypergeom.cdf(found, of, most + 1, drawn) < 0.05 + 1e-9

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from copy import copy
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
@@ -136,6 +137,26 @@ class Opened:
     def origins(self) -> tuple[Recording, ...]:
         """The recordings as their readers give them: which arrays of a data set hold them."""
         return tuple(content.recordings[i] for _, content, kept in self._usable for i in kept)
+
+    def select(self, which: Iterable[int]) -> Opened:
+        """Return the recordings with these numbers, in their order."""
+        chosen = set(which)
+        numbers = iter(range(len(self)))
+        usable = []
+        for file, content, kept in self._usable:
+            some = [i for i in kept if next(numbers) in chosen]
+            if some:
+                usable.append((file, content, some))
+        order = sorted(chosen)
+        part = copy(self)
+        part._usable = usable
+        part.names = tuple(self.names[i] for i in order)
+        part.lengths = tuple(self.lengths[i] for i in order)
+        if self.labels is not None:
+            part.labels = self.labels[order]
+        if self.targets is not None:
+            part.targets = tuple(self.targets[i] for i in order)
+        return part
 
     @property
     def clock(self) -> Clock:

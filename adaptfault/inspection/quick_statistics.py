@@ -1,0 +1,232 @@
+"""What one pass keeps of each recording of a data set, so that parts of it are merged by putting
+them one behind the other.
+
+Of each recording: the range of each cell, sums that tell whether it moves with those beside it
+(:mod:`diagnostics.when.together`), five frames that tell the direction of load and the step of the
+converter; and of all how often frames repeat. The size depends on the number of recordings, not on
+that of frames.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import chain
+from os import PathLike
+from pathlib import Path
+from typing import Any
+from zipfile import BadZipFile
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adaptfault.data.atomic import atomic_write
+from adaptfault.data.recordings import Opened, Recordings
+from adaptfault.data.recordings.errors import InputError
+from adaptfault.data.summary import Summary
+from adaptfault.inspection.naming import Naming, classes_of
+from diagnostics import SensorLayout
+from diagnostics.preprocessing.readings import RecordingBlocks
+from diagnostics.sensor.repeated_frames import Repetitions
+from diagnostics.when import Spans
+from diagnostics.when.together import Together
+
+SCHEMA = "adaptfault.quick/1"
+
+_KEPT = 5  # frames of each recording, evenly spread
+
+
+@dataclass(frozen=True, eq=False)
+class Statistics:
+    """Statistics of n recordings.
+
+    Attributes:
+        layout: the array.
+        naming: of its pads and recordings, with the frames of each.
+        classes: of each recording; None: unknown.
+        spans: ranges of the readings.
+        together: sums.
+        sample: float32 ``[n, 5, D]``, frames of each.
+        missing: int ``[D]``, readings.
+        repetitions: of frames.
+        left_out: recordings and files that could not be read.
+    """
+
+    layout: SensorLayout
+    naming: Naming
+    classes: tuple[str, ...] | None
+    spans: Spans
+    together: Together
+    sample: NDArray[np.float32]
+    missing: NDArray[np.int64]
+    repetitions: Repetitions
+    left_out: int = 0
+
+    @classmethod
+    def of(cls, log: Opened | Recordings, left_out: int = 0) -> Statistics:
+        """Return the statistics of a data set, read once."""
+        layout = log.layout
+        naming = Naming.of(log)
+        present = layout.present.ravel()
+        spans = []
+        together = []
+        pieces = []
+        repetitions = []
+        sample = np.full((len(naming.lengths), _KEPT, layout.n_cells), np.nan, np.float32)
+        missing = np.zeros(layout.n_cells, np.int64)
+        for number, first, frames in _pieces(log, naming.lengths):
+            valid = RecordingBlocks([frames]).valid(layout.full_scale, present)
+            spans.append(Spans.of(valid))
+            together.append(Together.of(valid.given, layout))
+            pieces.append(len(frames))
+            repetitions.append(Repetitions.of(frames[:, present]))
+            missing += np.isnan(valid.given[0]).sum(axis=0)
+            kept = np.linspace(0, naming.lengths[number] - 1, _KEPT).astype(int) - first
+            here = (kept >= 0) & (kept < len(frames))
+            sample[number, here] = valid.given[0][kept[here]]
+        classes = classes_of(log)
+        return cls(
+            layout,
+            naming,
+            None if classes is None else tuple(classes),
+            Spans.joined(spans).whole(pieces, naming.lengths),
+            Together.joined(together).whole(pieces, naming.lengths),
+            sample,
+            missing,
+            Repetitions.joined(repetitions),
+            left_out,
+        )
+
+    @classmethod
+    def joined(cls, parts: Sequence[Statistics]) -> Statistics:
+        """Return those of all parts, in their order.
+
+        Raises:
+            ValueError: they are not of one array.
+        """
+        first = parts[0]
+        for part in parts:
+            if part.layout.to_dict() != first.layout.to_dict():
+                raise ValueError(
+                    f"the parts are not of one array: {first.layout} and {part.layout}; state"
+                    " --shape, --full-scale, --unit and --rate for each"
+                )
+        names = chain.from_iterable(part.naming.recordings for part in parts)
+        lengths = chain.from_iterable(part.naming.lengths for part in parts)
+        classes = None
+        if all(part.classes is not None for part in parts):
+            classes = tuple(one for part in parts for one in part.classes or ())
+        return cls(
+            first.layout,
+            Naming(first.naming.pads, tuple(names), tuple(lengths)),
+            classes,
+            Spans.joined([part.spans for part in parts]),
+            Together.joined([part.together for part in parts]),
+            np.concatenate([part.sample for part in parts]),
+            np.sum([part.missing for part in parts], axis=0),
+            Repetitions.joined([part.repetitions for part in parts]),
+            sum(part.left_out for part in parts),
+        )
+
+    @property
+    def summary(self) -> Summary:
+        """What the recordings hold; rest is the median of the lowest readings."""
+        known = self.spans.known.any(axis=0)
+        counts, sums = self.together.sums[:2].sum(axis=1)
+        classes: dict[str, int] = {}
+        for name in self.classes or ():
+            classes[name] = classes.get(name, 0) + 1
+        rest = np.full(self.layout.n_cells, np.nan)
+        rest[known] = np.nanmedian(self.spans.low[:, known], axis=0)
+        return Summary(
+            layout=self.layout,
+            lengths=np.array(self.naming.lengths, np.int64),
+            mean=np.where(counts > 0, sums / np.maximum(counts, 1), np.nan),
+            lowest=np.fmin.reduce(self.spans.low),
+            highest=np.fmax.reduce(self.spans.high),
+            rest=rest,
+            step=None,
+            missing=self.missing,
+            classes=classes,
+        )
+
+    def save(self, path: str | PathLike[str]) -> None:
+        """Write a part for :meth:`load`; a file holds the old content or the new, never a part.
+
+        Raises:
+            OSError: it cannot be written.
+        """
+        about = {
+            "schema": SCHEMA,
+            "layout": self.layout.to_dict(),
+            "pads": self.naming.pads,
+            "recordings": self.naming.recordings,
+            "lengths": list(map(int, self.naming.lengths)),
+            "classes": self.classes,
+            "frames": self.repetitions.frames,
+            "repeated": self.repetitions.repeated,
+            "left_out": self.left_out,
+        }
+        stored = io.BytesIO()
+        np.savez_compressed(
+            stored,
+            about=np.frombuffer(json.dumps(about).encode(), np.uint8),
+            low=self.spans.low,
+            high=self.spans.high,
+            sums=self.together.sums,
+            sample=self.sample,
+            missing=self.missing,
+            between=self.repetitions.between,
+        )
+        atomic_write(path, stored.getvalue())
+
+    @classmethod
+    def load(cls, path: str | PathLike[str]) -> Statistics:
+        """Read a part.
+
+        Raises:
+            InputError: it is none, or is damaged.
+        """
+        try:
+            with np.load(path, allow_pickle=False) as held:
+                about: dict[str, Any] = json.loads(held["about"].tobytes())
+                if about["schema"] != SCHEMA:
+                    raise ValueError(f"has the schema {about['schema']}")
+                classes = about["classes"]
+                names = tuple(about["recordings"])
+                naming = Naming(tuple(about["pads"]), names, tuple(about["lengths"]))
+                counted = Repetitions(about["frames"], about["repeated"], held["between"])
+                return cls(
+                    SensorLayout.from_dict(about["layout"]),
+                    naming,
+                    None if classes is None else tuple(classes),
+                    Spans(held["low"], held["high"]),
+                    Together(held["sums"]),
+                    held["sample"],
+                    held["missing"],
+                    counted,
+                    about["left_out"],
+                )
+        except (OSError, ValueError, KeyError, TypeError, BadZipFile) as error:
+            what = "is no part of a check, or is damaged; write it again with check --shard"
+            raise InputError.at(Path(path), what) from error
+
+
+def _pieces(
+    log: Opened | Recordings, lengths: Sequence[int]
+) -> Iterator[tuple[int, int, NDArray[Any]]]:
+    """Yield the number of a recording, the first frame of a piece in it, and the piece."""
+    if isinstance(log, Recordings):
+        for number, frames in enumerate(log.frames):
+            yield number, 0, frames
+        return
+    number = 0
+    first = 0
+    for piece in log.pieces():
+        while first >= lengths[number]:
+            number += 1
+            first = 0
+        yield number, first, piece
+        first += len(piece)

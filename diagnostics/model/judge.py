@@ -13,7 +13,7 @@ move are refuted, the whole array does what the reference never saw: nobody is b
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,6 +35,7 @@ _WORST = 0.5  # of the highest evidence: who leaves in one round
 _ROUNDS = 16
 _CERTAIN = 6.0  # evidence that a healthy cell does not reach
 _SAFETY = 1.5
+_GOES = 8.0  # evidence that a fault has gone
 HELD = 3  # pieces at the end at one load: it may be stuck
 _PREVALENCE = 0.03
 _WEIGHS = 20.0  # cells that the usual prevalence is worth
@@ -169,7 +170,7 @@ class Model:
         failing = self.lines.failing(observed, self.moving(log), of_groups)
         if (failing.cells & ~of_groups.cells).any():
             observed = self._by_trusted(log, failing.cells)
-        units = Units.of(observed, self.odd)
+        units = replace(Units.of(observed, self.odd), goes=_GOES)
         evidence = np.stack([way.evidence(observed, units) for way in WAYS])
         evidence = self._certain(evidence, units)
         log_odds: Floats = logit(_PREVALENCE) + _of_any(evidence, WAYS)

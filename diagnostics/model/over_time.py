@@ -25,7 +25,7 @@ _OFTEN = 0.3
 _MOST = 40.0  # log ratio whose exponential is taken
 _FAILS = 0.05  # of the units, P(a fault that comes and goes comes)
 _RECOVERS = 0.15
-_GOES = 3.0  # evidence that a fault has gone
+_DENIES = 0.5  # of the evidence before, by which a fault has gone
 
 
 @dataclass(frozen=True)
@@ -37,12 +37,14 @@ class Units:
         of_piece: int ``[n]``, unit of each piece.
         odd: ``[units, D]``, P(a healthy cell is odd).
         opens: bool ``[units]``, whether a recording begins with it.
+        goes: evidence that a fault has gone, with which it is none.
     """
 
     begins: Cells
     of_piece: Cells
     odd: Array
     opens: Mask
+    goes: float = np.inf
 
     @classmethod
     def of(cls, observed: Observed, odd: Array) -> Units:
@@ -69,7 +71,7 @@ def bounded(ratio: Array, odd: Array) -> Array:
 def throughout(ratio: Array, units: Units) -> Array:
     """Return the evidence ``[D]`` of a fault in all pieces."""
     of_units = units.of_units(ratio)
-    return _unless_gone(of_units.sum(axis=0), of_units)
+    return _unless_gone(of_units.sum(axis=0), of_units, units.goes)
 
 
 def _since_each(ratio: Array, units: Units) -> Array:
@@ -98,15 +100,21 @@ def for_good(ratio: Array, units: Units) -> Array:
         return at_once
     most = since.max(axis=0)
     later = np.log(np.exp(since[1:] - most).mean(axis=0) + np.finfo(float).tiny) + most
-    return _unless_gone(np.logaddexp(at_once, later) - np.log(2), units.of_units(ratio))
+    found: Array = np.logaddexp(at_once, later) - np.log(2)
+    return _unless_gone(found, units.of_units(ratio), units.goes)
 
 
-def _unless_gone(evidence: Array, of_units: Array) -> Array:
+def _unless_gone(evidence: Array, of_units: Array, goes: float) -> Array:
     """Return the evidence ``[D]`` of a fault that lasts: no more than what the log says since the
-    likeliest end of it, where that denies it."""
+    likeliest end of it, where that denies it: half as much as the fault was told by."""
+    from_here = _from_here(of_units)
+    begins = from_here.argmax(axis=0)
     sums = np.cumsum(of_units, axis=0)
-    since = sums[-1] - sums.max(axis=0)
-    found: Array = np.where(since < -_GOES, np.minimum(evidence, since), evidence)
+    shown = np.arange(len(sums))[:, None] >= begins
+    since = sums[-1] - np.where(shown, sums, -np.inf).max(axis=0)
+    told = from_here.max(axis=0) - since
+    gone = since < -np.maximum(goes, _DENIES * told)
+    found: Array = np.where(gone, np.minimum(evidence, since), evidence)
     return found
 
 
@@ -126,7 +134,7 @@ def now_and_then(ratio: Array, units: Units) -> Array:
     of_units = doubted.of_units(ratio)
     total: Array = coming_and_going(of_units, units.opens).sum(axis=0)
     once = of_units.cumsum(axis=0).max(axis=0) - np.log(len(of_units))
-    return np.where(once > total, _unless_gone(total, of_units), total)
+    return np.where(once > total, _unless_gone(total, of_units, units.goes), total)
 
 
 def coming_and_going(

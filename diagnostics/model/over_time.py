@@ -25,6 +25,7 @@ _OFTEN = 0.3
 _MOST = 40.0  # log ratio whose exponential is taken
 _FAILS = 0.05  # of the units, P(a fault that comes and goes comes)
 _RECOVERS = 0.15
+_FREEDOM = 3.0  # evidence that a fault that comes and goes gains by its freedom
 _DENIES = 0.5  # of the evidence before, by which a fault has gone
 
 
@@ -134,7 +135,8 @@ def now_and_then(ratio: Array, units: Units) -> Array:
     of_units = doubted.of_units(ratio)
     total: Array = coming_and_going(of_units, units.opens).sum(axis=0)
     once = of_units.cumsum(axis=0).max(axis=0) - np.log(len(of_units))
-    return np.where(once > total, _unless_gone(total, of_units, units.goes), total)
+    told_once = once > total - _FREEDOM
+    return np.where(told_once, _unless_gone(total, of_units, units.goes), total)
 
 
 def coming_and_going(

@@ -48,10 +48,9 @@ def fitted() -> SelfDiagnosis:
 
 
 @pytest.fixture(scope="module")
-def model() -> Model:
-    fitted = fit_model(presses(0, 80), LAYOUT, np.zeros(64, bool))
-    assert fitted is not None
-    return fitted
+def model(fitted) -> Model:
+    assert fitted._model is not None
+    return fitted._model
 
 
 @pytest.fixture

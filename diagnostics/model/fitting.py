@@ -57,6 +57,7 @@ _OFTEN = 0.2
 _SHORTEST = 24  # frames of a recording that is taken apart
 _LOGS = 32
 _LENGTHS = (3, 6, 6, 6, 6, 6, 6, 40)  # recordings of a log
+_SHORT = 6  # of a short one
 _DEAD = (0.0, 0.04, 0.08, 0.16)  # shares of the cells that are dead in it
 _EXCEED = 0.1  # healthy cells of a log exceed the limit of all
 
@@ -293,11 +294,11 @@ def _judge_logs(
     """Let a model know the evidence of each way that healthy cells reach, lines and groups with
     them, in logs that are held out, with dead cells beside."""
     cells = np.flatnonzero(model.living)
-    highest = np.zeros((len(WAYS), len(model.present)))
+    highest = np.zeros((2, len(WAYS), len(model.present)), np.float32)
+    every: tuple[list[Array], list[Array]] = ([], [])
+    units = np.ones(2, np.intp)
     of_lines = np.zeros(len(model.lines.on), np.float32)
     of_groups = np.zeros(len(model.groups.odd), np.float32)
-    every = []
-    longest = 1
     pieces = 1
     for i in range(_LOGS):
         size = min(len(reference.recordings), _LENGTHS[i % len(_LENGTHS)])
@@ -318,15 +319,18 @@ def _judge_logs(
         of_group, _ = model.groups.evidence(judgement.observed.log, moving)
         of_groups = np.maximum(of_groups, of_group)
         healthy = np.setdiff1d(cells, dead)
-        highest[:, healthy] = np.maximum(highest[:, healthy], evidence[:, healthy])
-        every.append(evidence[:, healthy])
-        longest = max(longest, len(record.units))
+        long = int(size > _SHORT)
+        highest[long][:, healthy] = np.maximum(highest[long][:, healthy], evidence[:, healthy])
+        every[long].append(evidence[:, healthy])
+        units[long] = max(units[long], len(record.units))
         pieces = max(pieces, len(record))
-    reached = np.concatenate(every, axis=1)
-    tail = np.quantile(reached, 1 - _EXCEED / len(cells), axis=1)
-    model.highest = np.maximum(highest, tail[:, None]).astype(np.float32)
-    model.reached = longest
-    model.lines = replace(model.lines, highest=of_lines, reached=longest)
+    for of_length, logs in zip(highest, every, strict=True):
+        if logs:
+            tail = np.quantile(np.concatenate(logs, axis=1), 1 - _EXCEED / len(cells), axis=1)
+            np.maximum(of_length, tail[:, None], out=of_length)
+    model.highest = np.maximum.accumulate(highest)
+    model.reached = np.maximum.accumulate(units)
+    model.lines = replace(model.lines, highest=of_lines, reached=int(units.max()))
     model.groups = replace(model.groups, highest=of_groups, reached=pieces)
 
 

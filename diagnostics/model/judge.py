@@ -87,8 +87,9 @@ class Model:
         length: frames of a piece.
         present, living: bool ``[D]``, cells that there are, and that ever moved.
         odd: ``[D]``, share of the units in which each healthy cell is odd.
-        highest: ``[ways, D]``, evidence of each way that a healthy cell reaches.
-        reached: units of the longest log in which they did.
+        highest: ``[2, ways, D]``, evidence of each way that a healthy cell reaches in a short log
+            and in a long one.
+        reached: int ``[2]``, units of these logs.
         lines, groups: of the array.
     """
 
@@ -100,7 +101,7 @@ class Model:
     living: Mask
     odd: Array
     highest: Array
-    reached: int
+    reached: Cells
     lines: Lines
     groups: Groups
 
@@ -118,9 +119,20 @@ class Model:
     ) -> Model:
         """Return the model before healthy logs tell how odd cells are."""
         odd = np.full(len(present), USUAL, np.float32)
-        highest = np.zeros((len(WAYS), len(present)), np.float32)
+        highest = np.zeros((2, len(WAYS), len(present)), np.float32)
+        reached = np.ones(2, np.intp)
         return cls(
-            symbols, flatness, predictor, length, present, living, odd, highest, 1, lines, groups
+            symbols,
+            flatness,
+            predictor,
+            length,
+            present,
+            living,
+            odd,
+            highest,
+            reached,
+            lines,
+            groups,
         )
 
     def recorder(self) -> Recorder:
@@ -141,8 +153,11 @@ class Model:
     ) -> Array:
         """Return evidence of the ``chosen`` ways so that what a healthy cell may reach in a log
         stays below certainty; it grows with the log."""
-        longer = max(1.0, len(units.begins) / self.reached)
-        most = _SAFETY * longer * self.highest[chosen]
+        short, long = self.reached.tolist()
+        of_short, of_long = self.highest[:, chosen]
+        share = np.clip((len(units.begins) - short) / max(1, long - short), 0, 1)
+        longer = max(1.0, len(units.begins) / long)
+        most = _SAFETY * longer * (of_short + share * (of_long - of_short))
         found: Array = evidence * np.where(evidence > 0, _CERTAIN / np.maximum(_CERTAIN, most), 1)
         return found
 

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from adaptfault.data.recordings.errors import Problem, located
 from adaptfault.data.recordings.facts.labels import natural_order
-from adaptfault.data.recordings.files import Found
 from adaptfault.data.recordings.survey import Content
 from diagnostics import SensorLayout
 from diagnostics.preprocessing.copies import find_copies
@@ -27,22 +26,19 @@ _SHOWN = 4
 _NAMED = re.compile(r"(?P<name>.*?[^\W\d_])[-_ ]*\d+")
 
 
-def doubts(
-    files: Sequence[tuple[Found, Content]], layout: SensorLayout, *, labelled: bool
-) -> list[Problem]:
+def doubts(contents: Sequence[Content], layout: SensorLayout, *, labelled: bool) -> list[Problem]:
     """Return warnings about files that can be read.
 
     Args:
-        files: those that are used.
+        contents: of those that are used.
         layout: the array.
-        labelled: whether the recordings have classes.
+        labelled: whether the recordings have classes, or targets.
     """
-    contents = [content for _, content in files]
     found = [
         _two_scales(contents),
         _too_high(contents, layout),
         _last_axis(contents),
-        None if labelled else _classes_in_names([file for file, _ in files]),
+        None if labelled else _classes_in_names(contents),
     ]
     return [Problem("warning", text) for text in found if text is not None]
 
@@ -125,7 +121,7 @@ def _change(frames: NDArray[np.float64], axis: int) -> float:
     return float(np.nanmean(steps)) if np.isfinite(steps).any() else 0.0
 
 
-def _classes_in_names(files: Sequence[Found]) -> str | None:
+def _classes_in_names(files: Sequence[Content]) -> str | None:
     """Return that the names of files in one folder begin with a few words, each of several
     files."""
     names = [_NAMED.fullmatch(file.path.stem) for file in files]

@@ -7,9 +7,9 @@ for its frames. Small and large ones take the same way and get the same checks.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -33,7 +33,6 @@ from adaptfault.data.recordings.facts.infer import PAPER, SLACK
 from adaptfault.data.recordings.facts.layout_file import LAYOUT_NAME, layout_beside, not_stated
 from adaptfault.data.recordings.facts.rates import Clock, Elapsed
 from adaptfault.data.recordings.facts.resolve import (
-    Resolved,
     check_agreement,
     check_statements,
     given_array,
@@ -42,7 +41,7 @@ from adaptfault.data.recordings.facts.resolve import (
 from adaptfault.data.recordings.facts.targets import TargetTable, target_files
 from adaptfault.data.recordings.files import Found, find
 from adaptfault.data.recordings.readers import check_stated, readers
-from adaptfault.data.recordings.recording import BLOCK, Recording
+from adaptfault.data.recordings.recording import BLOCK, Shape
 from adaptfault.data.recordings.survey import Content, Surveyor
 from diagnostics import SensorLayout
 from diagnostics.shown import shown
@@ -98,58 +97,52 @@ class Opened:
             :class:`~adaptfault.data.recordings.dataset.Recordings`.
         inferred: as in :class:`Loaded`.
         problems: errors and warnings.
+        origins: the recordings as their readers give them: which arrays of a data set hold them.
         late_problems: warnings about the range of readings, after a whole iteration.
     """
 
     def __init__(
         self,
-        usable: Sequence[tuple[Found, Content, list[int]]],
-        resolved: Resolved,
+        contents: Sequence[Content],
+        layout: SensorLayout,
+        inferred: tuple[str, ...],
         tables: Calibration | None,
         problems: list[Problem],
-        targets: dict[Path, NDArray[np.float32]] | None = None,
-        value_names: tuple[str, ...] = (),
+        values: TargetTable | None,
     ) -> None:
-        self.layout = resolved.layout
-        self.inferred = resolved.inferred
-        self.names = tuple(_name(file, content, i) for file, content, kept in usable for i in kept)
-        self.lengths = tuple(content.surveys[i].length for _, content, kept in usable for i in kept)
-        labels = [
-            content.labels[i] if content.labels and targets is None else None
-            for _, content, kept in usable
-            for i in kept
-        ]
-        self.labels, self.class_names = class_indices(
-            labels, [content.facts.class_names for _, content, _ in usable], problems
-        )
-        self.value_names = value_names
-        self.targets = (
-            None
-            if targets is None
-            else tuple(targets[file.path.resolve()] for file, _, kept in usable for _ in kept)
-        )
-        self.problems = tuple(problems)
-        self._usable = usable
+        self._contents = contents
         self._tables = tables
+        self.layout = layout
+        self.inferred = inferred
+        each = [(content, i) for content in contents for i in content.kept]
+        self._surveys = [content.surveys[i] for content, i in each]
+        self.origins = tuple(content.recordings[i] for content, i in each)
+        self.names = tuple(content.name(i) for content, i in each)
+        self.lengths = tuple(survey.length for survey in self._surveys)
+        labels = [content.labels[i] if content.labels else None for content, i in each]
+        orders = [content.facts.class_names for content in contents]
+        self.labels, self.class_names = class_indices(labels, orders, problems)
+        self.value_names: tuple[str, ...] = ()
+        self.targets: tuple[NDArray[np.float32], ...] | None = None
+        if values is not None:
+            self.value_names = values.names
+            self.targets = tuple(one.targets for one, _ in each if one.targets is not None)
+        self.problems = tuple(problems)
         self.late_problems: tuple[Problem, ...] = ()
-
-    @property
-    def origins(self) -> tuple[Recording, ...]:
-        """The recordings as their readers give them: which arrays of a data set hold them."""
-        return tuple(content.recordings[i] for _, content, kept in self._usable for i in kept)
 
     def select(self, which: Iterable[int]) -> Opened:
         """Return the recordings with these numbers, in their order."""
         chosen = set(which)
-        numbers = iter(range(len(self)))
-        usable = []
-        for file, content, kept in self._usable:
-            some = [i for i in kept if next(numbers) in chosen]
-            if some:
-                usable.append((file, content, some))
         order = sorted(chosen)
+        numbers = iter(range(len(self)))
+        contents = []
+        for content in self._contents:
+            kept = tuple(i for i in content.kept if next(numbers) in chosen)
+            contents += [replace(content, kept=kept)] if kept else []
         part = copy(self)
-        part._usable = usable
+        part._contents = contents
+        part._surveys = [self._surveys[i] for i in order]
+        part.origins = tuple(self.origins[i] for i in order)
         part.names = tuple(self.names[i] for i in order)
         part.lengths = tuple(self.lengths[i] for i in order)
         if self.labels is not None:
@@ -161,20 +154,17 @@ class Opened:
     @property
     def clock(self) -> Clock:
         """How regular the times of the frames are."""
-        elapsed = Elapsed.of_all(
-            content.surveys[i].elapsed for _, content, kept in self._usable for i in kept
-        )
+        elapsed = Elapsed.of_all(survey.elapsed for survey in self._surveys)
         return Clock() if elapsed is None else elapsed.clock()
 
     @property
     def seconds(self) -> float:
         """How long the recordings took: by their times where there are some, else by their
         rate."""
-        surveys = [c.surveys[i] for _, c, kept in self._usable for i in kept]
-        timed = Elapsed.of_all(survey.elapsed for survey in surveys)
+        timed = Elapsed.of_all(survey.elapsed for survey in self._surveys)
         usual = None if timed is None else timed.unit()
         total = 0.0
-        for survey in surveys:
+        for survey in self._surveys:
             unit = survey.tick or usual
             if survey.elapsed is None or unit is None:
                 total += survey.length / self.layout.rate
@@ -225,14 +215,14 @@ class Opened:
         """Yield the blocks of each recording, calibrated."""
         clamped = np.zeros((2, self.layout.n_cells), dtype=np.int64)
         outside: list[Problem] = []
-        for _, content, kept in self._usable:
+        for content in self._contents:
             range_ = OutOfRange(content, self.layout)
-            for i in kept:
+            for i in content.kept:
                 yield self._blocks(content, i, clamped, range_)
             problem = range_.problem()
             if problem is not None:
                 outside.append(problem)
-        late = _summary(outside, len(self._usable), self.layout)
+        late = _summary(outside, len(self._contents), self.layout)
         if clamped.any():
             late.append(_clamped(clamped))
         self.late_problems = tuple(late)
@@ -253,21 +243,7 @@ class Opened:
             yield readings
 
 
-def load(
-    paths: PathName | Iterable[PathName],
-    *,
-    layout: SensorLayout | Sequence[int] | PathName | None = None,
-    shape: Sequence[int] | str | None = None,
-    labels: PathName | None = None,
-    frames: int | None = None,
-    calibration: Calibration | PathName | None = None,
-    full_scale: float | None = None,
-    unit: str | None = None,
-    rate: float | None = None,
-    strict: bool = False,
-    targets: PathName | None = None,
-    **stated: Any,
-) -> Loaded:
+def load(paths: PathName | Iterable[PathName], *, strict: bool = False, **options: Any) -> Loaded:
     """Read recordings; a bad file is listed and left out, the others are read.
 
     Each file's class comes from the file itself (.npz), or else from a table of labels, or else
@@ -310,21 +286,7 @@ def load(
         is in ``inferred``.
     """
     given = [paths] if isinstance(paths, str | PathLike) else list(paths)
-    opened = open_recordings(
-        given,
-        layout=layout,
-        shape=shape,
-        labels=labels,
-        frames=frames,
-        calibration=calibration,
-        full_scale=full_scale,
-        unit=unit,
-        rate=rate,
-        strict=strict,
-        targets=targets,
-        room=None,
-        **stated,
-    )
+    opened = open_recordings(given, strict=strict, room=None, **options)
     recordings = Recordings(
         tuple(opened),
         opened.layout,
@@ -362,96 +324,125 @@ def open_recordings(
     Args:
         room: bytes of frames that are kept in memory; None: all.
         progress: receives the number of frames of each block of the first reading.
-        paths, layout, shape, labels, frames, calibration, full_scale: as for :func:`load`.
-        unit, rate, strict, targets, stated: as for :func:`load`.
+        paths, stated, layout and the other options: as for :func:`load`.
 
     Raises:
         InputError: as :func:`load`.
     """
     given = [Path(paths)] if isinstance(paths, str | PathLike) else [Path(path) for path in paths]
-    if not given:
-        raise InputError("no path given; name a recording or a folder of recordings")
-    if frames is not None and frames < 1:
-        raise InputError(
-            f"frames {frames}: expected the number of frames a recording must have, at least 1"
-        )
     if layout is not None and shape is not None:
         raise InputError("layout and shape both given: one of them is enough")
+    _check_options(given, frames, labels, targets)
     layout = shape if layout is None else layout
-    check_stated(stated)
-    if "key" in stated and not isinstance(stated["key"], str | None):
-        stated["key"] = ",".join(stated["key"])
     array = given_array(layout) if layout is not None else layout_beside(given)
-    grid = array.shape if isinstance(array, SensorLayout) else array
     tables = _calibration(calibration)
-    if labels is not None and targets is not None:
-        raise InputError(
-            "labels and targets both given: a model learns classes or values, not both"
-        )
     values = None if targets is None else TargetTable.read(Path(targets))
     tables_given = (layout, labels, calibration, targets)
     aside = {Path(p).resolve() for p in tables_given if isinstance(p, str | PathLike)}
     found, problems = find(given, readers(), aside)
-    surveyor = Surveyor(PAPER.full_scale * SLACK, 2**62 if room is None else room)
-    contents: list[tuple[Found, Content]] = []
-    notes: list[Path] = []
-    for file in found:
-        try:
-            with foreseeing(file.path):
-                recordings = list(file.reader.open(file.path, shape=grid, **stated))
-                if recordings:
-                    contents.append((file, surveyor(recordings, problems, progress)))
-                else:
-                    notes.append(file.path)
-        except InputError as error:  # the other files are read
-            problems.append(Problem("error", str(error)))
-    problems += _passed_over(notes)
-    targets_of = None
+    surveyor = Surveyor(PAPER.full_scale * SLACK, 2**62 if room is None else room, progress)
+    contents = _surveyed(found, _asked(stated, array), surveyor, problems)
     if values is not None:
-        contents, targets_of = target_files(contents, values, problems)
+        contents = target_files(contents, values, problems)
     else:
         contents = label_files(contents, None if labels is None else Path(labels), problems)
     if not contents:
         raise nothing_left(problems)
-    every = [content for _, content in contents]
-    resolved = resolve_layout(
-        every, array, full_scale, unit, rate, tables, not_stated(layout, given)
-    )
-    problems += resolved.problems
-    if tables is not None:
+    options = {"full_scale": full_scale, "unit": unit, "rate": rate}
+    unstated = not_stated(layout, given)
+    known, inferred = resolve_layout(contents, array, options, tables, unstated, problems)
+    is_beside = layout is None and array is not None
+    beside = f" of the {LAYOUT_NAME} beside the recordings" if is_beside else ""
+
+    def check(content: Content) -> None:
+        check_agreement(content, contents, tables is not None, rate)
+        check_width(content, known, beside, strict=strict)
+        if strict:
+            check_statements(content, known, tables is not None)
+
+    usable = _usable(contents, known, check, frames, problems)
+    return Opened(usable, known, inferred, tables, problems, values)
+
+
+def _check_options(
+    given: Sequence[Path], frames: int | None, labels: object, targets: object
+) -> None:
+    """Raise InputError where an option is wrong, or contradicts another one."""
+    if not given:
+        raise InputError("no path given; name a recording or a folder of recordings")
+    if frames is not None and frames < 1:
+        what = "expected the number of frames a recording must have, at least 1"
+        raise InputError(f"frames {frames}: {what}")
+    if labels is not None and targets is not None:
+        what = "a model learns classes or values, not both"
+        raise InputError(f"labels and targets both given: {what}")
+
+
+def _asked(stated: Mapping[str, Any], array: SensorLayout | Shape | None) -> dict[str, Any]:
+    """Return what readers are told of the files."""
+    check_stated(stated)
+    key = stated.get("key")
+    if not isinstance(key, str | None):
+        key = ",".join(key)
+    return {**stated, "key": key, "shape": getattr(array, "shape", array)}
+
+
+def _surveyed(
+    found: Sequence[Found], asked: Mapping[str, Any], surveyor: Surveyor, problems: list[Problem]
+) -> list[Content]:
+    """Return the contents of files; what cannot be read is told, and the others are read."""
+    contents = []
+    notes: list[Path] = []
+    for file in found:
         try:
-            tables.check(resolved.layout)
-        except ValueError as error:
-            raise InputError(f"calibration: {error}") from None
-    beside = layout is None and array is not None
+            with foreseeing(file.path):
+                recordings = list(file.reader.open(file.path, **asked))
+                if recordings:
+                    contents.append(surveyor(file, recordings, problems))
+                else:
+                    notes.append(file.path)
+        except InputError as error:
+            problems.append(Problem("error", str(error)))
+    problems += _passed_over(notes)
+    return contents
+
+
+def _usable(
+    contents: Sequence[Content],
+    layout: SensorLayout,
+    check: Callable[[Content], None],
+    frames: int | None,
+    problems: list[Problem],
+) -> list[Content]:
+    """Return the files that can be used; what is wrong, and doubts, are added to ``problems``.
+
+    Args:
+        contents: of the files.
+        layout: the array.
+        check: raises InputError where a file does not fit the array or the other files.
+        frames: that each recording must have; None: any.
+        problems: of all files.
+
+    Raises:
+        InputError: none can be used.
+    """
     usable = []
-    for file, content in contents:
+    for content in contents:
         try:
-            check_agreement(content, every, tables is not None, rate)
-            check_width(
-                content,
-                resolved.layout,
-                f" of the {LAYOUT_NAME} beside the recordings" if beside else "",
-                strict=strict,
-            )
-            if strict:
-                check_statements(content, resolved.layout, tables is not None)
+            check(content)
         except InputError as error:
             problems.append(Problem("error", str(error)))
             continue
-        kept, told = check_readings(content, resolved.layout, frames)
+        kept, told = check_readings(content, layout, frames)
         problems += told
         if kept:
-            usable.append((file, content, kept))
+            usable.append(replace(content, kept=tuple(kept)))
     if not usable:
         raise nothing_left(problems)
-    used = [(file, content) for file, content, _ in usable]
-    is_labelled = values is not None or any(content.labels for _, content in used)
-    problems += doubts(used, resolved.layout, labelled=is_labelled)
-    if frames is None:
-        problems += other_lengths([content for _, content, _ in usable])
-    names = () if values is None else values.names
-    return Opened(usable, resolved, tables, problems, targets_of, names)
+    is_labelled = any(one.labels or one.targets is not None for one in usable)
+    problems += doubts(usable, layout, labelled=is_labelled)
+    problems += other_lengths(usable) if frames is None else []
+    return usable
 
 
 def _passed_over(notes: Sequence[Path]) -> list[Problem]:
@@ -492,13 +483,6 @@ def _summary(out_of_range: list[Problem], files: int, layout: SensorLayout) -> l
         f" {layout.unit}: check the layout's full scale and unit; the first is"
     )
     return [Problem("warning", f"{what} {out_of_range[0].message}")]
-
-
-def _name(file: Found, content: Content, i: int) -> str:
-    name = content.recordings[i].name
-    if name is not None:
-        return name
-    return file.name if len(content.recordings) == 1 else f"{file.name}, recording {i}"
 
 
 def nothing_left(problems: Sequence[Problem]) -> InputError:

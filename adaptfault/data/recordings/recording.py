@@ -5,8 +5,7 @@ A reader of any format returns these; small and large files take the same way.
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -134,32 +133,3 @@ class Recording:
         if not values:
             raise InputError.at(self.facts.path, "holds no frames; record it again or remove it")
         return np.concatenate(values)
-
-
-def cut(frames: NDArray[Any]) -> Iterator[Block]:
-    """Yield frames ``[T, D]`` that are in memory in blocks."""
-    for first in range(0, len(frames), BLOCK):
-        yield Block(frames[first : first + BLOCK])
-
-
-def grid_shape(sizes: Sequence[int], given: Shape | None = None) -> Shape | None:
-    """Return ``(pads, rows, cols)`` of stored frames; None where they are flat.
-
-    Frames of four axes are ``[n, T, rows, cols]``, recordings of one pad. They are one recording
-    ``[T, pads, rows, cols]`` if T would be 1, or if the ``given`` shape has those pads, rows and
-    columns. Frames of three axes are ``[n, T, D]``, or ``[T, rows, cols]`` if the given shape has
-    those rows and columns.
-    """
-    sizes = tuple(int(size) for size in sizes)
-    if given is not None and len(sizes) == 4 and given[0] > 1 and sizes[1:] == given:
-        return given
-    if (
-        given is not None
-        and len(sizes) == 3
-        and (1, *sizes[1:]) == given
-        and sizes[2] != math.prod(given)
-    ):
-        return given
-    if len(sizes) < 4:
-        return None
-    return (sizes[-3] if len(sizes) == 5 else 1), sizes[-2], sizes[-1]

@@ -4,8 +4,9 @@ readings, what is missing, the times. What fits into memory is kept, so that it 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 
 from adaptfault.data.recordings.errors import NO_FRAMES, InputError, Problem, foreseeing
 from adaptfault.data.recordings.facts.rates import Elapsed
+from adaptfault.data.recordings.files import Found
 from adaptfault.data.recordings.recording import Block, Facts, Recording, Shape
 from diagnostics import SensorLayout
 from diagnostics.preprocessing.levels import LOW
@@ -126,16 +128,22 @@ class Content:
     """The recordings of one file, and what it states about the array.
 
     Attributes:
+        file: where it was found.
         facts: of the file.
         recordings: at least one.
         surveys: of each.
         labels: the class of each recording; None without.
+        targets: the values of its one recording; None without.
+        kept: which recordings can be used.
     """
 
+    file: Found
     facts: Facts
     recordings: tuple[Recording, ...]
     surveys: tuple[Survey, ...]
     labels: tuple[str, ...] | None = None
+    targets: NDArray[np.float32] | None = None
+    kept: tuple[int, ...] = ()
 
     @property
     def path(self) -> Path:
@@ -195,6 +203,14 @@ class Content:
         elapsed = self.elapsed
         return None if elapsed is None else elapsed.rate(self.tick)
 
+    def name(self, recording: int) -> str:
+        """Return the name of a recording: as the file calls it, else that of the file."""
+        name = self.recordings[recording].name
+        if name is not None:
+            return name
+        several = f", recording {recording}" if len(self.recordings) > 1 else ""
+        return f"{self.file.name}{several}"
+
     def where(self, recording: int, frame: int | None = None) -> str:
         """Return the place of a recording or a frame in this file as text.
 
@@ -222,21 +238,23 @@ class Surveyor:
     Args:
         limit: readings above it are counted.
         room: bytes of frames that are kept in memory.
+        step: receives the number of frames of each block.
     """
 
-    def __init__(self, limit: float, room: int) -> None:
+    def __init__(self, limit: float, room: int, step: Callable[[int], None]) -> None:
         self.limit = limit
         self.room = room
+        self.step = step
 
     def __call__(
-        self, recordings: Sequence[Recording], problems: list[Problem], step: Callable[[int], None]
+        self, file: Found, recordings: Sequence[Recording], problems: list[Problem]
     ) -> Content:
         """Return the content of a file; warnings are added to ``problems``.
 
         Args:
-            recordings: of one file.
+            file: where it was found.
+            recordings: in it.
             problems: of all files.
-            step: receives the number of frames of each block.
 
         Raises:
             InputError: all recordings are damaged. Single damaged ones are left out, with an
@@ -248,7 +266,7 @@ class Surveyor:
         for recording in recordings:
             try:
                 with foreseeing(recording.facts.path):
-                    survey, recording = self._survey(recording, problems, step)
+                    survey, recording = self._survey(recording, problems)
             except InputError as error:  # the other recordings are read
                 failed.append(error)
                 continue
@@ -263,13 +281,10 @@ class Surveyor:
         problems += facts.problems
         held = [recording.label for recording in kept]
         labels = tuple(label for label in held if label is not None)
-        return Content(
-            facts, tuple(kept), tuple(surveyed), labels if len(labels) == len(held) else None
-        )
+        every = labels if len(labels) == len(held) else None
+        return Content(file, facts, tuple(kept), tuple(surveyed), every)
 
-    def _survey(
-        self, recording: Recording, problems: list[Problem], step: Callable[[int], None]
-    ) -> tuple[Survey, Recording]:
+    def _survey(self, recording: Recording, problems: list[Problem]) -> tuple[Survey, Recording]:
         """Return what a recording holds, and the recording, with its frames where there is room."""
         survey = Survey(self.limit)
         blocks: list[Block] | None = []
@@ -278,16 +293,12 @@ class Surveyor:
             survey.add(block)
             problems += block.problems
             size += block.values.nbytes
-            step(len(block.values))
+            self.step(len(block.values))
             if size > self.room:
                 blocks = None
             if blocks is not None:
                 blocks.append(replace(block, problems=()))
         if blocks is not None:
             self.room -= size
-            recording = replace(recording, blocks=_again(blocks))
+            recording = replace(recording, blocks=partial(iter, blocks))
         return survey, recording
-
-
-def _again(blocks: list[Block]) -> Callable[[], Iterator[Block]]:
-    return lambda: iter(blocks)

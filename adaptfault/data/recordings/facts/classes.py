@@ -12,51 +12,41 @@ from numpy.typing import NDArray
 
 from adaptfault.data.recordings.errors import Problem, located
 from adaptfault.data.recordings.facts.labels import natural_order, read_label_table
-from adaptfault.data.recordings.files import Found
 from adaptfault.data.recordings.survey import Content
 
 
 def label_files(
-    contents: Sequence[tuple[Found, Content]], table: Path | None, problems: list[Problem]
-) -> list[tuple[Found, Content]]:
+    contents: Sequence[Content], table: Path | None, problems: list[Problem]
+) -> list[Content]:
     """Label the files that carry no labels, by table or folder; a file without one among others is
     left out."""
     known: dict[Path, dict[Path, str]] = {}
-    tables = (
-        {table}
-        if table is not None
-        else {file.table for file, _ in contents if file.table is not None}
-    )
-    for path in sorted(tables):
+    listings = {table or content.file.table for content in contents}
+    for path in sorted(path for path in listings if path is not None):
         known[path], wrong = read_label_table(path)
         problems += wrong
-    bare = [
-        file for file, content in contents if content.labels is None and not (table or file.table)
-    ]
+    files = [content.file for content in contents if content.labels is None]
+    bare = [file for file in files if not (table or file.table)]
     nested = {file.root for file in bare if not file.is_direct}
     many = bool(nested) or len({file.path.parent.resolve() for file in bare}) > 1
     labelled = []
-    for file, content in contents:
+    for content in contents:
+        file = content.file
         listing = table or file.table
-        label = None
-        remedy = ""
-        if content.labels is not None:
-            labelled.append((file, content))
+        if content.labels is not None or not (listing or many):
+            labelled.append(content)
             continue
+        label = None
+        remedy = "lies beside the folders of the classes: left out; move it into one"
         if listing is not None:
             label = known[listing].get(file.path.resolve())
             remedy = f"is not in the table {listing}: left out; add a line for it"
-        elif file.root in nested and file.is_direct:
-            remedy = "lies beside the folders of the classes: left out; move it into one"
-        elif many:
+        elif file.root not in nested or not file.is_direct:
             label = file.path.resolve().parent.name
-        else:
-            labelled.append((file, content))
-            continue
         if label is None:
             problems.append(Problem("warning", located(file.path, remedy)))
         else:
-            labelled.append((file, replace(content, labels=(label,) * len(content.recordings))))
+            labelled.append(replace(content, labels=(label,) * len(content.recordings)))
     return labelled
 
 

@@ -4,8 +4,7 @@ inference."""
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -37,21 +36,6 @@ _SAME_RATE = 0.05
 """Rates that differ by less are the same: those of bags are measured."""
 
 
-@dataclass(frozen=True)
-class Resolved:
-    """The layout of the recordings.
-
-    Attributes:
-        layout: the array.
-        inferred: one sentence for each fact that no file, layout or option states.
-        problems: warnings.
-    """
-
-    layout: SensorLayout
-    inferred: tuple[str, ...] = ()
-    problems: tuple[Problem, ...] = ()
-
-
 def given_array(
     layout: SensorLayout | Sequence[int] | str | PathLike[str] | None,
 ) -> SensorLayout | Shape | None:
@@ -70,104 +54,103 @@ def given_array(
 def resolve_layout(
     contents: Sequence[Content],
     array: SensorLayout | Shape | None,
-    full_scale: float | None,
-    unit: str | None,
-    rate: float | None,
+    options: Mapping[str, Any],
     tables: Calibration | None,
-    unstated: Collection[str] = (),
-) -> Resolved:
+    unstated: Collection[str],
+    problems: list[Problem],
+) -> tuple[SensorLayout, tuple[str, ...]]:
     """Decide on the layout: options first, then a layout that was given, then the files, then
-    inference.
+    inference. Return it, and one sentence for each fact that was inferred.
 
     Args:
         contents: of the files.
         array: a layout or a shape that was given.
-        full_scale, unit, rate: options.
+        options: full_scale, unit and rate; None where they are not given.
         tables: of calibration.
         unstated: which of these three the layout leaves to the files.
+        problems: warnings are added to them.
 
     Raises:
         InputError: an option makes no layout, or the shape or the scale cannot be inferred.
     """
     inferred = _of_readers(contents)
-    problems: list[Problem] = []
-    overrides = {"full_scale": full_scale, "unit": unit, "rate": rate}
     if isinstance(array, SensorLayout):
-        stated: dict[str, Any] = {name: getattr(array, name) for name in (*overrides, *_KEPT)}
         shape = array.shape
+        stated = {name: getattr(array, name) for name in (*options, *_KEPT)}
         stated |= {name: _first(getattr(c.facts, name) for c in contents) for name in unstated}
-        if tables is not None and array.unit != "N":  # that was the layout of the counts
-            stated |= {"full_scale": None, "unit": None}
     else:
         shape, reason = (array, "") if array else infer_shape(contents)
         if reason:
             inferred.append(f"shape {'x'.join(map(str, shape))} ({reason}); otherwise give --shape")
         problems += _without_rows(contents, shape)
-        fitting = [c for c in contents if c.shape in (None, shape)]
-        stated = {
-            name: _first(getattr(content.facts, name) for content in fitting)
-            for name in (*overrides, "present")
-        }
-        stated |= next(
-            (content.facts.declared for content in fitting if content.facts.declared), {}
-        )
-        if tables is not None:  # files describe counts
-            stated |= {"full_scale": None, "unit": None}
-        unknown = [name for name in ("full_scale", "rate") if not (overrides[name] or stated[name])]
-        inferred += _lost(contents, unknown)
-    stated |= {name: value for name, value in overrides.items() if value is not None}
+        stated = _of_files(contents, shape, options)
+        stated["device"] = _device(contents, problems)
+    # what is stated without newtons is that of the counts
+    if tables is not None and not (isinstance(array, SensorLayout) and array.unit == "N"):
+        stated |= {"full_scale": None, "unit": None}
+    stated |= {name: value for name, value in options.items() if value is not None}
     if not isinstance(array, SensorLayout):
-        stated["device"], several = _device(contents)
-        problems += several
+        inferred += _lost(contents, [name for name in ("full_scale", "rate") if not stated[name]])
     if stated["full_scale"] is None:
-        if tables is not None:
-            stated["unit"] = stated["unit"] or "N"
-            stated["full_scale"] = tables.full_scale
-        else:
-            scaled = [
-                content for content in contents if content.width == math.prod(shape)
-            ] or contents
-            scale = infer_scale(scaled, shape)
-            stated["unit"] = stated["unit"] or scale.unit
-            stated["full_scale"] = scale.full_scale
-            what = f"full scale {scale.full_scale:g} {stated['unit']} ({scale.reason})"
-            inferred.append(f"{what}; otherwise give --full-scale and --unit")
-            problems += scale.problems
+        inferred += _scale(contents, shape, tables, stated, problems)
     measured, reason_of_rate = _measured_rate(contents)
     known = {name: value for name, value in stated.items() if value is not None}
     if measured is not None:
         known.setdefault("rate", measured)
     try:
-        usual = (
-            "N"
-            if tables is not None
-            else default_unit(float(stated["full_scale"]), shape, contents)
-        )
-        known.setdefault("unit", usual)
+        usual = default_unit(float(stated["full_scale"]), shape, contents)
+        known.setdefault("unit", usual if tables is None else "N")
         pads, rows, wide = shape
-        names = _names(contents, math.prod(shape))
-        if isinstance(array, SensorLayout) and array.names is not None:
-            names = array.names
+        names = getattr(array, "names", None) or _names(contents, math.prod(shape))
         layout = SensorLayout(pads, rows, wide // known.get("axes", 1), names=names, **known)
     except (TypeError, ValueError, ZeroDivisionError) as error:
         raise InputError(f"layout: {error}; correct the option") from None
+    problems += _contradicted(contents, layout, tables)
     if stated["rate"] is None:
         inferred.append(f"rate {layout.rate:g} Hz ({reason_of_rate}); otherwise give --rate")
-    problems += [] if tables is not None else _contradicted(contents, layout)
-    return Resolved(layout, tuple(inferred), tuple(problems))
+    return layout, tuple(inferred)
 
 
-def _device(contents: Sequence[Content]) -> tuple[str | None, list[Problem]]:
+def _of_files(contents: Sequence[Content], shape: Shape, options: Iterable[str]) -> dict[str, Any]:
+    """Return what the files of a shape state."""
+    fitting = [content for content in contents if content.shape in (None, shape)]
+    names = (*options, "present")
+    stated = {name: _first(getattr(one.facts, name) for one in fitting) for name in names}
+    declared = [one.facts.declared for one in fitting if one.facts.declared]
+    return stated | dict(next(iter(declared), {}))
+
+
+def _scale(
+    contents: Sequence[Content],
+    shape: Shape,
+    tables: Calibration | None,
+    stated: dict[str, Any],
+    problems: list[Problem],
+) -> list[str]:
+    """State full scale and unit by tables, or as the readings show; return the sentence on it."""
+    if tables is not None:
+        stated |= {"unit": stated["unit"] or "N", "full_scale": tables.full_scale}
+        return []
+    scaled = [content for content in contents if content.width == math.prod(shape)]
+    scale = infer_scale(scaled or contents, shape)
+    stated |= {"unit": stated["unit"] or scale.unit, "full_scale": scale.full_scale}
+    problems += scale.problems
+    what = f"full scale {scale.full_scale:g} {stated['unit']} ({scale.reason})"
+    return [f"{what}; otherwise give --full-scale and --unit"]
+
+
+def _device(contents: Sequence[Content], problems: list[Problem]) -> str | None:
     """Return the device that the files state; None, and a warning where they state several."""
     of: dict[str, Path] = {}
     for content in contents:
         if content.facts.device is not None:
             of.setdefault(content.facts.device, content.path)
     if len(of) < 2:
-        return next(iter(of), None), []
+        return next(iter(of), None)
     told = ", ".join(f"{device} ({path.name})" for device, path in of.items())
     what = f"recordings of {len(of)} devices: {told}; cells are judged as of one, load them apart"
-    return None, [Problem("warning", what)]
+    problems.append(Problem("warning", what))
+    return None
 
 
 def _names(contents: Sequence[Content], cells: int) -> Sequence[str] | None:
@@ -245,8 +228,20 @@ def _lost(contents: Sequence[Content], missing: Sequence[str]) -> list[str]:
     ]
 
 
-def _contradicted(contents: Sequence[Content], layout: SensorLayout) -> list[Problem]:
-    """Warn if the first file that states a scale states another than the layout that is used."""
+def _contradicted(
+    contents: Sequence[Content], layout: SensorLayout, tables: Calibration | None
+) -> list[Problem]:
+    """Warn if the first file that states a scale states another than the layout that is used.
+
+    Raises:
+        InputError: the tables, which state the scale, are of another array.
+    """
+    if tables is not None:
+        try:
+            tables.check(layout)
+        except ValueError as error:
+            raise InputError(f"calibration: {error}") from None
+        return []
     content = next((c for c in contents if c.facts.full_scale is not None), None)
     if content is None or content.facts.full_scale == layout.full_scale:
         return []

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import io
 import math
 import stat
 import zipfile
 from pathlib import Path
+from typing import IO, Any
 
 import numpy as np
 
@@ -63,14 +65,7 @@ def check_archive(path: Path, archive: zipfile.ZipFile, arrays: tuple[str, ...])
         except KeyError:
             continue
         with archive.open(about) as file:
-            version = np.lib.format.read_magic(file)
-            if version == (1, 0):
-                shape, _, kind = np.lib.format.read_array_header_1_0(file)
-            elif version == (2, 0):
-                shape, _, kind = np.lib.format.read_array_header_2_0(file)
-            else:
-                shape = ()
-                kind = np.dtype(np.uint8)
+            shape, kind = _header(file)
         if kind.kind in "US" and kind.itemsize > 4 * _MOST_TEXT:
             raise InputError.at(
                 path, f"array {name!r} declares texts of {kind.itemsize:,} bytes; shorten them"
@@ -92,18 +87,19 @@ def check_array(path: Path, data: bytes) -> None:
         InputError: it declares more.
         ValueError: the header cannot be read.
     """
-    import io
-
-    file = io.BytesIO(data)
-    version = np.lib.format.read_magic(file)
-    read = (
-        np.lib.format.read_array_header_1_0
-        if version == (1, 0)
-        else np.lib.format.read_array_header_2_0
-    )
-    shape, _, kind = read(file)
+    shape, kind = _header(io.BytesIO(data))
     if (declared := math.prod(shape) * kind.itemsize) > len(data):
         raise InputError.at(
             path,
             f"declares {declared:,} bytes and holds {len(data):,}: it is cut off; write it again",
         )
+
+
+def _header(file: IO[bytes]) -> tuple[tuple[int, ...], np.dtype[Any]]:
+    """Return the shape and the type that the header of an array declares."""
+    is_first = np.lib.format.read_magic(file) == (1, 0)
+    read = np.lib.format.read_array_header_1_0
+    if not is_first:
+        read = np.lib.format.read_array_header_2_0
+    shape, _, kind = read(file)
+    return shape, kind

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from adaptfault.data.recordings.errors import InputError, Problem, located
 from adaptfault.data.recordings.facts.labels import existing_file, table_lines
-from adaptfault.data.recordings.files import Found
 from adaptfault.data.recordings.survey import Content
 
 _WHOLE = -1  # stands for the frame where a line holds the values of a whole recording
@@ -155,22 +154,20 @@ class TargetTable:
 
 
 def target_files(
-    contents: Sequence[tuple[Found, Content]], table: TargetTable, problems: list[Problem]
-) -> tuple[list[tuple[Found, Content]], dict[Path, NDArray[np.float32]]]:
-    """Return the files with targets, and the targets by resolved path; a file without is left
-    out."""
+    contents: Sequence[Content], table: TargetTable, problems: list[Problem]
+) -> list[Content]:
+    """Return the files with targets, which have no classes then; a file without is left out."""
     problems += table.problems
     kept = []
-    targets = {}
-    for file, content in contents:
+    for content in contents:
+        lengths = [survey.length for survey in content.surveys]
         try:
-            lengths = [survey.length for survey in content.surveys]
-            targets[file.path.resolve()] = table.of(file.path, lengths)
+            targets = table.of(content.path, lengths)
         except InputError as error:
             problems.append(Problem("error", str(error)))
         else:
-            kept.append((file, content))
-    return kept, targets
+            kept.append(replace(content, targets=targets, labels=None))
+    return kept
 
 
 def _number(text: str) -> float | None:

@@ -65,26 +65,22 @@ def open(
             clear.
     """
     problems: list[Problem] = []
-    times: list[int] = []
-    width = 0
-    others = 0
-    first: Message | None = None
     source = partial(bag_messages, path, shape=shape, topic=topic, field=field)
-    for message in source(problems):
-        if first is None:
-            first = message
-            width = len(message.values)
+    messages = source(problems)
+    first = next(messages, None)
+    if first is None:
+        raise InputError.at(path, "holds no message that can be read; record it again")
+    width = len(first.values)
+    times = [first.time]
+    others = 0
+    for message in messages:
         if len(message.values) == width:
             times.append(message.time)
         else:
             others += 1
-    if first is None:
-        raise InputError.at(path, "holds no message that can be read; record it again")
     if others:
-        what = (
-            f"{others} messages hold another number of readings than the first, {width}: left out"
-        )
-        problems.append(Problem("warning", located(path, what)))
+        what = f"{others} messages hold another number of readings than the first, {width}"
+        problems.append(Problem("warning", located(path, f"{what}: left out")))
     stamps = np.sort(np.array(times))
     facts = Facts(
         path,

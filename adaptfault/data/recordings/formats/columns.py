@@ -48,6 +48,10 @@ _RISES = 0.95  # share of its steps
 _EVEN = 1e-3  # of a step, by which equal ones differ
 _FAR = 10.0  # times the largest reading
 _LOOK = 2_000_000  # characters in which that reading is looked for
+_TAKEN = (
+    "is the first column a time? it was taken as one; --time-column says which, --columns says"
+    " which columns are readings"
+)
 _LISTED = 12  # columns that a message names
 
 
@@ -116,8 +120,8 @@ def choose_columns(
     table = _Named(path, dialect)
     ignored = set() if ignore is None else set(table.several("ignore", ignore))
     wanted = None if columns is None else table.several("columns", columns)
-    roles = _Roles.of(table, {*ignored, *(wanted or ())}, time_column, label_column)
-    aside = {*no_readings(table.names), *roles.columns}
+    roles = _by_names(table, {*ignored, *(wanted or ())}, time_column, label_column)
+    aside = {*no_readings(table.names), roles.clock, roles.label, roles.episode}
     readings = [i for i in range(dialect.width) if i not in aside] if wanted is None else wanted
     inferred: tuple[str, ...] = ()
     problems: tuple[Problem, ...] = ()
@@ -126,12 +130,9 @@ def choose_columns(
         ticks = _clock_of(path, dialect, even=wanted is not None or not fills)
         if ticks is not None:
             roles = replace(roles, clock=0, unit=ticks or None)
-            what = (
-                "is the first column a time? it was taken as one; --time-column says which,"
-                " --columns says which columns are readings"
-            )
-            problems = (Problem("warning", located(path, what)),)
-    readings = [i for i in readings if i not in ignored and i not in roles.columns]
+            problems = (Problem("warning", located(path, _TAKEN)),)
+    aside = {*ignored, roles.clock, roles.label, roles.episode}
+    readings = [i for i in readings if i not in aside]
     if wanted is None:
         readings, inferred = _numbered(table.names, readings, shape)
     table.refuse_text(readings)
@@ -143,53 +144,35 @@ def choose_columns(
     names = tuple(table.names[i] for i in readings) if table.names else ()
     shown = shape_of(names) if shape is None and names else None
     others = set(range(dialect.width)) - {*readings, roles.clock}
-    return Columns(
-        dialect.width,
-        tuple(readings),
-        roles.clock,
-        roles.unit,
-        roles.label,
-        roles.episode,
-        names,
-        None if shown is None else shown[0],
-        "" if shown is None else shown[1],
-        inferred,
-        table.has_unreadable(others),
-        problems,
+    return replace(
+        roles,
+        readings=tuple(readings),
+        names=names,
+        shape=None if shown is None else shown[0],
+        shape_reason="" if shown is None else shown[1],
+        inferred=inferred,
+        has_text=table.has_unreadable(others),
+        problems=problems,
     )
 
 
-@dataclass(frozen=True)
-class _Roles:
-    """The columns that are no readings, but say something of them."""
-
-    clock: int | None
-    unit: str | None
-    label: int | None
-    episode: int | None
-
-    @property
-    def columns(self) -> set[int | None]:
-        return {self.clock, self.label, self.episode}
-
-    @classmethod
-    def of(
-        cls,
-        table: _Named,
-        taken: Collection[int],
-        time_column: str | int | None,
-        label_column: str | int | None,
-    ) -> _Roles:
-        """Find them by options, or by names among the columns that are not ``taken``."""
-        free = ["" if i in taken else name for i, name in enumerate(table.names)]
-        clock = _at(free, clock_of(free))
-        if time_column is not None:
-            clock = table.one("time-column", time_column)
-        label = _at(free, first_of(LABELS, free))
-        if label_column is not None:
-            label = table.one("label-column", label_column)
-        unit = None if clock is None or not table.names else unit_of(table.names[clock])
-        return cls(clock, unit, label, _at(free, first_of(EPISODES, free)))
+def _by_names(
+    table: _Named,
+    taken: Collection[int],
+    time_column: str | int | None,
+    label_column: str | int | None,
+) -> Columns:
+    """Return the columns that are no readings, but say something of them: by options, or by names
+    among the columns that are not ``taken``."""
+    free = ["" if i in taken else name for i, name in enumerate(table.names)]
+    clock = _at(free, clock_of(free))
+    if time_column is not None:
+        clock = table.one("time-column", time_column)
+    label = _at(free, first_of(LABELS, free))
+    if label_column is not None:
+        label = table.one("label-column", label_column)
+    unit = None if clock is None or not table.names else unit_of(table.names[clock])
+    return Columns(table.width, (), clock, unit, label, _at(free, first_of(EPISODES, free)))
 
 
 def _at(names: Sequence[str], name: str | None) -> int | None:

@@ -3,6 +3,17 @@ of one matrix a frame.
 
 How a file writes its table is found once, from its first lines (:mod:`.dialect`), and so is what
 its columns hold (:mod:`.columns`).
+
+A column that the header names as a time (``time``, ``timestamp``, ``t``, with a unit as in
+``time_ms``) is no reading, wherever it stands; it gives the rate. One that numbers the episodes
+(``episode_index``, ``trial``) or names the class (``label``, ``task``) divides the lines into
+recordings. A first column without a name, or called ``index``, ``frame`` or ``sample``, is no
+reading either, nor is a column that is not numbered where most are. A first column without a name
+of a time is taken as one, with a warning, where it rises in equal steps, or far beyond all
+readings. An empty cell and ``nan`` are missing readings and become NaN. Blank lines and comments
+are skipped. A last line that a power failure cut off is left out with a warning, and so is
+everything from zero bytes on, which stand for data that did not reach the disk. A cut inside the
+last number of a full line cannot be detected.
 """
 
 from __future__ import annotations
@@ -66,17 +77,6 @@ def open(
     """Return the recording of a text file of T lines x D readings, separated by commas, semicolons,
     tabs or blanks, with or without a header line and lines of text above it. A file of blocks of
     lines has one matrix a frame, see :mod:`.matrices`.
-
-    A column that the header names as a time (``time``, ``timestamp``, ``t``, with a unit as in
-    ``time_ms``) is no reading, wherever it stands; it gives the rate. One that numbers the episodes
-    (``episode_index``, ``trial``) or names the class (``label``, ``task``) divides the lines into
-    recordings. A first column without a name, or called ``index``, ``frame`` or ``sample``, is no
-    reading either, nor is a column that is not numbered where most are. A first column without a
-    name of a time is taken as one, with a warning, where it rises in equal steps, or far beyond all
-    readings. An empty cell and ``nan`` are missing readings and become NaN. Blank lines and
-    comments are skipped. A last line that a power failure cut off is left out with a warning, and
-    so is everything from zero bytes on, which stand for data that did not reach the disk. A cut
-    inside the last number of a full line cannot be detected.
 
     Args:
         path: the file. One that may be notes, as ``.txt``, gives no recording if it holds no line

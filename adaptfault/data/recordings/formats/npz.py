@@ -7,9 +7,10 @@ import json
 import math
 import re
 import zipfile
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
-from functools import lru_cache
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from functools import lru_cache, partial
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -23,17 +24,12 @@ from adaptfault.data.printable import printable
 from adaptfault.data.recordings.dataset import Recordings
 from adaptfault.data.recordings.errors import InputError, Problem, located
 from adaptfault.data.recordings.facts.sizes import check_archive, check_array
-from adaptfault.data.recordings.formats.datasets.axes import time_first
+from adaptfault.data.recordings.formats.datasets.beside import Stated
+from adaptfault.data.recordings.formats.datasets.contents import Contents, Opened, texts
+from adaptfault.data.recordings.formats.datasets.features import Pads
+from adaptfault.data.recordings.formats.datasets.reader import recordings_of
 from adaptfault.data.recordings.formats.text import read_bytes, read_json_object, shown
-from adaptfault.data.recordings.recording import (
-    DECLARED,
-    Block,
-    Facts,
-    Recording,
-    Shape,
-    cut,
-    grid_shape,
-)
+from adaptfault.data.recordings.recording import DECLARED, Facts, Recording, Shape
 
 SUFFIXES = (".npz",)
 
@@ -54,6 +50,7 @@ _KEYS = (
 _RATES = ("sampling_hz", "rate", "rate_hz", "rate_Hz")  # in the JSON file beside an archive
 _BITS = re.compile(r"\s*(\d{1,2})[ -]?bits?\b", re.ASCII)
 
+_FRAMES = "frames"
 _SHOWN = 8  # arrays in a message
 
 _EXPECTED = (
@@ -83,100 +80,88 @@ def open(path: Path, *, shape: Shape | None = None, **stated: Any) -> list[Recor
     Raises:
         InputError: the file is damaged, or an array is missing, of a wrong kind or a wrong size.
     """
-    _read.cache_clear()  # the file may have changed since
-    archive = _read(path, shape)
-
-    def blocks(i: int) -> Callable[[], Iterator[Block]]:
-        return lambda: cut(_read(path, shape).frames[i])
-
-    return [
-        Recording(
-            archive.facts,
-            blocks(i),
-            archive.names[i] if archive.names else None,
-            None if archive.labels is None else archive.labels[i],
-        )
-        for i in range(len(archive.frames))
-    ]
-
-
-@dataclass(frozen=True, eq=False)
-class _Archive:
-    """The recordings of an archive, in memory."""
-
-    facts: Facts
-    frames: tuple[NDArray[Any], ...]
-    names: tuple[str, ...]
-    labels: tuple[str, ...] | None
-
-
-@lru_cache(maxsize=1)
-def _read(path: Path, given: Shape | None) -> _Archive:
-    """Return the recordings of an archive; the last one stays in memory."""
-    arrays = _open_archive(path)
-    if "frames" not in arrays:
-        what = f"holds no array 'frames'; {_others(path)}"
-        raise InputError.at(path, f"{what}; save the recordings as frames=[n, T, pads, rows, cols]")
+    _arrays.cache_clear()  # the file may have changed since
+    arrays = _arrays(path)
+    recordings = array_recordings(path, partial(_opened, path), shape)
+    facts = recordings[0].facts
     beside, problems = _read_sibling(path)
-    mask = arrays.get("present", arrays.get("factory_mask"))
-    if (
-        mask is not None
-        and mask.ndim == 3
-        and mask.shape[0] > 1
-        and arrays["frames"].shape[1:] == mask.shape
-    ):
-        # one recording [T, pads, rows, cols]: the mask shows the pads
-        arrays["frames"] = arrays["frames"][None]
-    lengths = arrays.get("lengths")
-    if lengths is None and (given is not None or arrays["frames"].ndim < 4):
-        arrays["frames"], turned = time_first(path, "frames", arrays["frames"], given)
-        problems = (*problems, *turned)
-    frames, shape = as_recordings(
-        path, arrays["frames"], lengths, given if lengths is None else None
-    )
-    present = _present(path, arrays, shape, int(frames[0].shape[1]) if frames else 0)
-    shape = shape or (
-        None if present is None else (present.shape[0], present.shape[1], present.shape[2])
-    )
     class_names = _texts(path, arrays, "class_names") or _class_names_beside(path, beside)
     if len(set(class_names)) < len(class_names):
         raise InputError.at(path, "a class name occurs twice; give each class a name of its own")
-    labels = _labels(path, arrays, class_names, len(frames))
+    labels = _labels(path, arrays, class_names, len(recordings))
     numbered = labels is not None and not class_names and arrays["labels"].dtype.kind in "iu"
     if numbered:
         class_names = tuple(str(i) for i in range(int(arrays["labels"].max()) + 1))
-    names = _texts(path, arrays, "names")
-    if names and len(names) != len(frames):
-        raise InputError.at(
-            path,
-            f"array 'names' has {len(names)} entries for {len(frames)} recordings; give one each",
-        )
-    unit = (
-        str(arrays["unit"].item())
-        if "unit" in arrays and arrays["unit"].size == 1
-        else _unit_beside(beside)
-    )
-    full_scale = _in_counts(beside.get("full_scale"))
-    rate = next((beside[key] for key in _RATES if key in beside), None)
-    for key, value in (("full_scale", full_scale), ("rate", rate)):
+    names = _texts(path, arrays, "names") or [None] * len(recordings)
+    if len(names) != len(recordings):
+        what = f"array 'names' has {len(names)} entries for {len(recordings)} recordings"
+        raise InputError.at(path, f"{what}; give one each")
+    present = _present(path, arrays, facts)
+    stated = {"full_scale": _in_counts(beside.get("full_scale"))}
+    stated["rate"] = next((beside[key] for key in _RATES if key in beside), None)
+    for key, value in stated.items():
         if isinstance(value, str):
             what = f"{key} is {shown(value)}, no number: ignored"
             problems = (*problems, Problem("warning", located(path.with_suffix(".json"), what)))
-    facts = Facts(
-        path,
-        counts=arrays["frames"].dtype.kind in "iu",
+    facts = replace(
+        facts,
         class_names=class_names,
         numbered=numbered,
-        shape=shape,
+        shape=facts.shape if present is None else present.shape,
         present=present,
-        full_scale=_scalar(path, arrays, "full_scale", full_scale),
-        rate=_scalar(path, arrays, "rate", rate),
-        unit=unit or None,
+        full_scale=_scalar(path, arrays, "full_scale", stated["full_scale"]),
+        rate=_scalar(path, arrays, "rate", stated["rate"]),
+        unit=_unit(arrays, beside),
         declared=_declared(arrays.get("layout")) | _device(arrays.get("device")),
-        stored=arrays["frames"].shape,
-        problems=problems,
+        problems=(*problems, *facts.problems),
     )
-    return _Archive(facts, frames, names, labels)
+    classes = labels or [None] * len(recordings)
+    each = zip(recordings, names, classes, strict=True)
+    return [replace(one, facts=facts, name=name, label=label) for one, name, label in each]
+
+
+def array_recordings(path: Path, opened: Opened, shape: Shape | None) -> list[Recording]:
+    """Return the recordings of an array ``frames``; it has no name that a mask could be called by,
+    and the shape that its axes show."""
+    found = recordings_of(path, opened, shape=shape, key=_FRAMES, stated=Stated())
+    facts = found[0].facts
+    facts = replace(facts, shape=Pads.of(facts.sizes).shape)
+    return [replace(one, facts=facts, arrays=()) for one in found]
+
+
+def frames_of(path: Path, frames: Any) -> Contents:
+    """Return an array ``frames`` as the contents of a file.
+
+    Raises:
+        InputError: an array of another kind or shape.
+    """
+    shape = list(frames.shape)
+    if frames.dtype.kind not in "iuf":
+        what = f"frames are of type {frames.dtype}; save whole or decimal numbers"
+        raise InputError.at(path, what)
+    if not 2 <= len(shape) <= 5:
+        raise InputError.at(path, f"frames have shape {shape}; {_EXPECTED}")
+    if 0 in shape:
+        what = f"frames have shape {shape} and hold no reading; record again"
+        raise InputError.at(path, what)
+    return Contents({_FRAMES: frames})
+
+
+@contextmanager
+def _opened(path: Path, names: Sequence[str] | None) -> Iterator[Contents]:
+    """Open what divides an archive into recordings."""
+    arrays = _arrays(path)
+    if _FRAMES not in arrays:
+        what = f"holds no array 'frames'; {_others(path)}"
+        raise InputError.at(path, f"{what}; save the recordings as frames=[n, T, pads, rows, cols]")
+    frames = arrays[_FRAMES]
+    mask = arrays.get("present", arrays.get("factory_mask"))
+    if mask is not None and mask.ndim == 3 and frames.shape[1:] == mask.shape and len(mask) > 1:
+        frames = frames[None]  # one recording [T, pads, rows, cols]: the mask shows the pads
+    contents = frames_of(path, frames)
+    if "lengths" in arrays:
+        contents.arrays["lengths"] = arrays["lengths"]
+    yield contents
 
 
 def _declared(layout: NDArray[Any] | None) -> dict[str, Any]:
@@ -261,7 +246,9 @@ def open_numpy(path: Path) -> Any:
         raise _damaged(path, error) from None
 
 
-def _open_archive(path: Path) -> dict[str, NDArray[Any]]:
+@lru_cache(maxsize=1)
+def _arrays(path: Path) -> dict[str, NDArray[Any]]:
+    """Return the arrays of an archive; those of the last one stay in memory."""
     opened = open_numpy(path)
     if not isinstance(opened, NpzFile):
         raise InputError.at(path, "is a single array; name it .npy")
@@ -296,86 +283,22 @@ def _damaged(path: Path, error: Exception, key: str = "") -> InputError:
     return InputError.at(path, what)
 
 
-def as_recordings(
-    path: Path, frames: NDArray[Any], lengths: NDArray[Any] | None, given: Shape | None = None
-) -> tuple[tuple[NDArray[Any], ...], Shape | None]:
-    """Return one array ``[T, D]`` a recording, and ``(pads, rows, cols)`` where the frames have
-    these axes.
-
-    Args:
-        path: the file, for messages.
-        frames: the array in it.
-        lengths: of the recordings, ``[n]``; None: they fill the array.
-        given: ``(pads, rows, cols)`` where the user states it; it may tell that the array is one
-            recording.
-
-    Raises:
-        InputError: an array of another kind or shape.
-    """
-    if frames.dtype.kind not in "iuf":
-        raise InputError.at(
-            path, f"frames are of type {frames.dtype}; save whole or decimal numbers"
-        )
-    if not 2 <= frames.ndim <= 5:
-        raise InputError.at(path, f"frames have shape {list(frames.shape)}; {_EXPECTED}")
-    if frames.size == 0:
-        raise InputError.at(
-            path, f"frames have shape {list(frames.shape)} and hold no reading; record again"
-        )
-    if frames.dtype.kind == "f":
-        with np.errstate(all="ignore"):  # what float32 cannot hold becomes infinite, and is missing
-            frames = frames.astype(np.float32)
-    if lengths is not None and _is_joined(frames, lengths):
-        return _parted(frames, lengths), grid_shape((1, *frames.shape))
-    shape = grid_shape(frames.shape, given)
-    is_one = frames.ndim == 2 or (frames.ndim == 4 and frames.shape[1] == 1)
-    if is_one or shape != grid_shape(frames.shape):
-        frames = frames[None]
-    frames = frames.reshape(*frames.shape[:2], -1)  # [n, T, D]
-    if lengths is None:
-        return tuple(frames), shape
-    n, longest = frames.shape[:2]
-    if lengths.dtype.kind not in "iu" or lengths.shape != (n,):
-        what = (
-            f"array 'lengths' is {lengths.dtype} {list(lengths.shape)}; expected whole numbers"
-            f" [{n}], one a recording, or any number of them whose sum is that of all frames"
-        )
-        raise InputError.at(path, what)
-    for i, length in enumerate(lengths.tolist()):
-        if not 0 <= length <= longest:
-            what = f"length {length}, but 'frames' has room for {longest}; correct 'lengths'"
-            raise InputError.at(path, what, f"recording {i}")
-    return tuple(one[:length] for one, length in zip(frames, lengths.tolist(), strict=True)), shape
-
-
-def _is_joined(frames: NDArray[Any], lengths: NDArray[Any]) -> bool:
-    """Return whether the frames of all recordings stand one behind the other."""
-    if lengths.dtype.kind not in "iu" or lengths.ndim != 1 or (lengths < 0).any():
-        return False
-    is_padded = frames.ndim > 2 and len(lengths) == len(frames)
-    return not is_padded and int(lengths.sum()) == len(frames)
-
-
-def _parted(frames: NDArray[Any], lengths: NDArray[Any]) -> tuple[NDArray[Any], ...]:
-    flat = frames.reshape(len(frames), -1)
-    return tuple(np.split(flat, np.cumsum(lengths)[:-1]))
-
-
 def _present(
-    path: Path, arrays: Mapping[str, NDArray[Any]], shape: Shape | None, width: int
+    path: Path, arrays: Mapping[str, NDArray[Any]], facts: Facts
 ) -> NDArray[np.bool_] | None:
     key = next((key for key in ("present", "factory_mask") if key in arrays), None)
     if key is None:
         return None
     present = arrays[key]
-    expected = shape or (present.shape if present.ndim == 3 and present.size == width else None)
+    expected = facts.shape
+    if expected is None and present.ndim == 3 and present.size == math.prod(facts.sizes[0]):
+        expected = present.shape
     # In another order of axes the mask would name other cells.
-    fitting = (
-        ()
-        if expected is None
-        else (expected, expected[1:] if expected[0] == 1 else expected, (math.prod(expected),))
-    )
-    if present.dtype.kind not in "biu" or expected is None or present.shape not in fitting:
+    fitting: tuple[tuple[int, ...], ...] = ()
+    if expected is not None:
+        flat = (math.prod(expected),)
+        fitting = (expected, expected[1:] if expected[0] == 1 else expected, flat)
+    if present.dtype.kind not in "biu" or present.shape not in fitting:
         size = list(expected) if expected else "[pads, rows, cols]"
         what = f"array {key!r} is {present.dtype} {list(present.shape)}; expected bool {size}"
         raise InputError.at(path, what)
@@ -401,7 +324,7 @@ def _labels(
             " recording",
         )
     if labels.dtype.kind in "US":
-        names = _decoded(labels)
+        names = tuple(texts(labels))
         for i, name in enumerate(names):
             if class_names and name not in class_names:
                 raise InputError.at(
@@ -427,14 +350,7 @@ def _texts(path: Path, arrays: Mapping[str, NDArray[Any]], key: str) -> tuple[st
             " text"
         )
         raise InputError.at(path, what)
-    return _decoded(arrays[key])
-
-
-def _decoded(array: NDArray[Any]) -> tuple[str, ...]:
-    return tuple(
-        text.decode("utf-8", "replace") if isinstance(text, bytes) else str(text)
-        for text in array.tolist()
-    )
+    return tuple(texts(arrays[key]))
 
 
 def _scalar(
@@ -486,7 +402,10 @@ def _class_names_beside(path: Path, beside: Mapping[str, Any]) -> tuple[str, ...
     return tuple(str(name) for name in names)
 
 
-def _unit_beside(beside: Mapping[str, Any]) -> str | None:
-    """Return the unit of a JSON file, if it is one word: longer text describes more than a unit."""
+def _unit(arrays: Mapping[str, NDArray[Any]], beside: Mapping[str, Any]) -> str | None:
+    """Return the unit of an archive, or else of its JSON file, if it is one word: longer text
+    describes more than a unit."""
+    if "unit" in arrays and arrays["unit"].size == 1:
+        return str(arrays["unit"].item()) or None
     unit = beside.get("unit", beside.get("units"))
     return unit if isinstance(unit, str) and len(unit.split()) == 1 and len(unit) <= 16 else None

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptfault.data.recordings.errors import InputError, Problem, located
+from adaptfault.data.recordings.errors import InputError
 from adaptfault.data.recordings.facts.infer import sides
 from adaptfault.data.recordings.formats.datasets.contents import Array
 from adaptfault.data.recordings.recording import Shape
@@ -86,22 +86,6 @@ def _doubt(arrays: Mapping[str, Array]) -> str:
         f" {stored}? Then give the array, --shape {pads}{grid} for {frames} frames; if not,"
         f" --shape {pads}{along} for {others[0]} frames"
     )
-
-
-def time_first(
-    path: Path, name: str, frames: NDArray[Any], shape: Shape | None
-) -> tuple[NDArray[Any], tuple[Problem, ...]]:
-    """Return an array, ``[1, T, pads, rows, cols]`` where its last axis is the time, and a warning
-    that it is.
-
-    Raises:
-        InputError: as :func:`is_time_last`.
-    """
-    is_array = frames.dtype.kind in "iuf" and frames.ndim > 1 and frames.size > 0
-    if not is_array or not is_time_last(path, {name: frames}, shape) or shape is None:
-        return frames, ()
-    turned = np.moveaxis(frames, -1, 0).reshape(1, -1, *shape)
-    return turned, (Problem("warning", located(path, TURNED.format(name))),)
 
 
 class TimeLast:

@@ -21,6 +21,7 @@ from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from adaptfault.data.recordings.errors import InputError, Problem, located
 from adaptfault.data.recordings.facts.episodes import Division, Episode, numbered
@@ -65,6 +66,7 @@ from adaptfault.data.recordings.formats.datasets.features import (
 from adaptfault.data.recordings.formats.datasets.parts import Part, Readings
 from adaptfault.data.recordings.recording import Facts, Shape
 
+_OUTER = ("frames", "recordings")  # names of arrays [n, T, ...]
 _ENDS = ("episode_ends", "lengths", "episode_lengths")
 _INDEX = "index"
 _SHOWN = 12  # arrays in a message
@@ -136,11 +138,18 @@ class Chooser:
                 self.path, what if missing is None else f"holds no column {missing!r}"
             )
         first = found[0][1]
-        if not self.contents.is_table and self.known is None:
+        if not self.contents.is_table and self.known is None and not self._is_divided(first[0]):
             chosen_arrays = {name: arrays[name] for name in first}
             self.is_turned = is_time_last(self.path, chosen_arrays, self.shape)
-        self.outer = self.ends is None and not self.is_turned and self._holds_recordings(first)
+        self.outer = not self.is_turned and self._holds_recordings(first)
         return found
+
+    def _is_divided(self, name: str) -> bool:
+        """Return whether the name and the axes of an array show that its first one is no cell."""
+        if last_part(name) not in _OUTER:
+            return False
+        axes = len(self.contents.arrays[name].shape)
+        return self.ends is not None or (self.shape is None and axes > 3)
 
     def _may_be_readings(self, name: str) -> bool:
         array = self.contents.arrays[name]
@@ -189,10 +198,16 @@ class Chooser:
         sizes = tuple(map(int, self.contents.arrays[names[0]].shape))
         if len(names) > 1 or len(sizes) < 3 or self.contents.is_table:
             return False
+        if self.ends is not None:
+            has_lengths = last_part(self.ends) != _ENDS[0]
+            return has_lengths and self.contents.arrays[self.ends].shape == sizes[:1]
         if self.shape is not None:
             cells = math.prod(self.shape)
-            return math.prod(sizes[1:]) != cells and math.prod(sizes[2:]) == cells
-        return len(sizes) == 5 or last_part(names[0]) in ("frames", "recordings")
+            fits = [cells == math.prod(sizes[axes:]) for axes in (1, 2)]
+            if fits[0] != fits[1]:
+                return fits[1]
+        is_one = len(sizes) == 4 and sizes[1] == 1  # [T, 1, rows, columns]
+        return len(sizes) == 5 or (last_part(names[0]) in _OUTER and not is_one)
 
     def row(self, part: Part) -> int | None:
         """Return what a table calls the first row of a recording: its column ``index``, or its
@@ -277,8 +292,7 @@ class Chooser:
             classes = self._classes(names[0])
             start = partial(Part, tuple(names), clock=clock, group=group)
             if self.outer:
-                frames = int(self.contents.arrays[names[0]].shape[1])
-                for i in range(length):
+                for i, frames in enumerate(self._lengths(names[0])):
                     label = classes.of_recording(i, length)
                     yield start(0, frames, outer=i, clock=None, label=label)
                 continue
@@ -313,19 +327,39 @@ class Chooser:
             raise InputError.at(self.path, what)
         return column
 
-    def _bounds(self, name: str, length: int) -> list[Episode]:
-        """Return the episodes whose ends an array tells."""
+    def _lengths(self, name: str) -> list[int]:
+        """Return the frames of each recording in an array ``[n, T, ...]``."""
+        count, longest = map(int, self.contents.arrays[name].shape[:2])
+        if self.ends is None:
+            return [longest] * count
+        lengths: list[int] = self._whole(self.ends).tolist()
+        for i, length in enumerate(lengths):
+            if not 0 <= length <= longest:
+                what = f"length {length}, but {name!r} has room for {longest}; correct"
+                raise InputError.at(self.path, f"{what} {self.ends!r}", f"recording {i}")
+        return lengths
+
+    def _whole(self, name: str) -> NDArray[np.int64]:
+        """Return an array of whole numbers that tells where episodes end."""
         stored = np.asarray(self.contents.arrays[name][:]).ravel()
         if stored.dtype.kind not in "iu":
             what = f"{name} holds no whole numbers; it holds where each episode ends"
             raise InputError.at(self.path, what)
-        stored = stored.astype(np.int64)
+        return stored.astype(np.int64)
+
+    def _bounds(self, name: str, length: int) -> list[Episode]:
+        """Return the episodes whose ends an array tells."""
+        stored = self._whole(name)
         ends = stored if last_part(name) == _ENDS[0] else np.cumsum(stored)
         if not len(ends) or (np.diff(ends, prepend=0) < 0).any():
             what = f"{name} does not rise; it holds where each episode ends"
             raise InputError.at(self.path, what)
         if ends[-1] > length:
             what = f"{name} ends at frame {ends[-1]}, but the readings hold {length}: cut off?"
+            if last_part(name) != _ENDS[0]:
+                came = f"array {name!r} is {stored.dtype} {list(stored.shape)}; expected"
+                what = f"{came} whole numbers [{length}], one a recording, or any number of them"
+                what += " whose sum is that of all frames"
             raise InputError.at(self.path, what)
         bounds = enumerate(pairwise([0, *ends.tolist()]))
         return [Episode(first, last, number) for number, (first, last) in bounds]

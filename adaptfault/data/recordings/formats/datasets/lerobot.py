@@ -5,19 +5,21 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from adaptfault.data.recordings.errors import NO_FRAMES, InputError, Problem, located
+from adaptfault.data.recordings.errors import NO_FRAMES, InputError
 from adaptfault.data.recordings.facts.labels import natural_key
 from adaptfault.data.recordings.facts.roles import named
 from adaptfault.data.recordings.formats.datasets import parquet
 from adaptfault.data.recordings.formats.datasets.beside import Stated
+from adaptfault.data.recordings.formats.datasets.contents import Contents, Opener
 from adaptfault.data.recordings.formats.datasets.extra import imported
-from adaptfault.data.recordings.formats.datasets.features import GUESSED, Pads, Sizes, choose
+from adaptfault.data.recordings.formats.datasets.features import Sizes, choose
 from adaptfault.data.recordings.formats.datasets.reader import recordings_of
 from adaptfault.data.recordings.formats.text import read_json_object
 from adaptfault.data.recordings.recording import Block, Facts, Recording, Shape
@@ -70,35 +72,31 @@ def open(
             numbers[name] = sizes
     _ = named(path, "time-column", time_column, list(features))
     own_label = named(path, "label-column", label_column, list(features))
-    names = choose(path, numbers, key)
-    pads = Pads.of([numbers[name] for name in names], shape)
-    rate = info.get("fps")
-    facts = Facts(
-        path,
-        counts=all("int" in features[name]["dtype"] for name in names),
-        shape=pads.shape,
-        present=pads.present,
-        sizes=pads.sizes,
-        places=pads.places,
-        problems=(Problem("warning", located(path, f"{', '.join(names)}: {GUESSED}")),)
-        if pads.is_guessed
-        else (),
-        rate=float(rate) * pads.steps if isinstance(rate, int | float) and rate > 0 else None,
-    )
+    chosen = {name: numbers[name] for name in choose(path, numbers, key)}
     files = sorted(path.glob("data/**/*.parquet"), key=lambda file: natural_key(str(file)))
     if not files:
         raise InputError.at(path, "holds no data/*.parquet; copy the whole data set")
     tasks = {} if own_label is not None else _tasks(path)
     places = Stated(time_column, _TASK if tasks else own_label)
-    chosen = {name: numbers[name] for name in names}
+    opened = partial(_opened, info.get("fps"))
     recordings = []
     for file in files:
-        for recording in _episodes(path, file, shape, places, chosen, facts):
+        for recording in _episodes(path, file, opened, shape, places, chosen):
             task = tasks.get(recording.label or "", recording.label)
-            recordings.append(replace(recording, facts=facts, label=task))
+            recordings.append(replace(recording, label=task))
     if not recordings:
         raise InputError.at(path, NO_FRAMES)
-    return recordings
+    read = [one.facts for one in recordings if one.arrays]
+    facts = replace(read[0], path=path) if read else Facts(path)
+    return [replace(one, facts=facts) for one in recordings]
+
+
+@contextmanager
+def _opened(fps: object, file: Path, names: Sequence[str] | None) -> Iterator[Contents]:
+    """Open a file, with the rate that the data set states."""
+    with parquet.opened(file, names) as contents:
+        contents.attributes[""] = {"fps": fps}
+        yield contents
 
 
 def _sizes(about: object) -> Sizes | None:
@@ -114,24 +112,24 @@ def _sizes(about: object) -> Sizes | None:
 def _episodes(
     path: Path,
     file: Path,
+    opened: Opener,
     shape: Shape | None,
     stated: Stated,
     chosen: Mapping[str, Sizes],
-    facts: Facts,
 ) -> Iterator[Recording]:
     """Yield the episodes of a file; one that cannot be read says so when its frames are read."""
-    opened = partial(parquet.opened, file)
+    opening = partial(opened, file)
     try:
-        with opened(None) as contents:
+        with opening(None) as contents:
             if stated.label == _TASK and _TASK not in contents.arrays:
                 stated = replace(stated, label=None)
         recordings = recordings_of(
-            file, opened, shape=shape, key=",".join(chosen), stated=stated, known=chosen
+            file, opening, shape=shape, key=",".join(chosen), stated=stated, known=chosen
         )
     except InputError as error:
         if str(error).endswith(NO_FRAMES):
             return
-        yield Recording(facts, _failing(error), file.relative_to(path).as_posix())
+        yield Recording(Facts(path), _failing(error), file.relative_to(path).as_posix())
         return
     for recording in recordings:
         name = None if recording.number is None else f"episode {recording.number}"

@@ -105,7 +105,7 @@ def blocks(path: Path, opened: Opened, held: Readings, pads: Pads) -> Iterator[B
             where = f"{part.name or part.names[0]}, frames {first} to {last - 1}"
             damaged = "cannot be read ({}): damaged, or cut off; copy it again"
             with foreseeing(path, damaged, where):
-                values = [np.asarray(array[first:last]) for array in arrays]
+                values = [np.array(array[first:last]) for array in arrays]
                 stamps = None if times is None else np.asarray(times[first:last])
             if any(len(value) != last - first for value in values):
                 raise InputError.at(path, "is cut off; copy it again", where)

@@ -74,14 +74,11 @@ def check_readings(
         kept.append(i)
         if survey.elapsed is not None:
             problems += _disorder(content, i, survey.elapsed)
-        for name, found, at in (
-            ("infinite", survey.infinite, survey.first_infinite),
-            ("missing", survey.missing, survey.first_missing),
-        ):
-            cells = (found > 0) & present
+        for name, gaps in (("infinite", survey.infinite), ("missing", survey.missing)):
+            cells = (gaps.count > 0) & present
             if cells.any():
-                counts[name] += int(found[cells].sum())
-                first.setdefault(name, content.where(i, int(at[cells].min())))
+                counts[name] += int(gaps.count[cells].sum())
+                first.setdefault(name, content.where(i, int(gaps.first[cells].min())))
     for name, count in counts.items():
         if count:
             kept_as = "taken" if name == "infinite" else "kept"

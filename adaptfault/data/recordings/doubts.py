@@ -21,7 +21,6 @@ from diagnostics.preprocessing.copies import find_copies
 _TOO_HIGH = 0.1  # of the full scale: healthy contacts go further
 _APART = 50.0  # times, between the largest readings of two groups of files
 _SHARE = 0.2  # of the files that a group has at least
-_SMOOTHER = 3.0  # times, that readings change less along the last axis than from frame to frame
 _SHOWN = 4
 _NAMED = re.compile(r"(?P<name>.*?[^\W\d_])[-_ ]*\d+")
 
@@ -37,7 +36,6 @@ def doubts(contents: Sequence[Content], layout: SensorLayout, *, labelled: bool)
     found = [
         _two_scales(contents),
         _too_high(contents, layout),
-        _last_axis(contents),
         None if labelled else _classes_in_names(contents),
     ]
     return [Problem("warning", text) for text in found if text is not None]
@@ -93,32 +91,6 @@ def _too_high(contents: Sequence[Content], layout: SensorLayout) -> str | None:
         " same unit? --full-scale and --unit state another one"
     )
     return located(stated[0].path, what)
-
-
-def _last_axis(contents: Sequence[Content]) -> str | None:
-    """Return that the last axis of an array looks like that of the frames."""
-    for content in contents:
-        if content.shape is None or len(content.facts.stored) not in (4, 5):
-            continue
-        frames = content.head.reshape(-1, *content.shape)
-        if len(frames) < 3 or content.shape[2] < 3 * len(frames):
-            continue
-        along_frames = _change(frames, 0)
-        along_last = _change(frames, 3)
-        if along_last > 0 and along_frames > _SMOOTHER * along_last:
-            what = (
-                f"frames have shape {list(content.facts.stored)}, and readings change less along"
-                " the last axis than from frame to frame: is the last axis time? Expected"
-                " [n, T, rows, cols]"
-            )
-            return located(content.path, what)
-    return None
-
-
-def _change(frames: NDArray[np.float64], axis: int) -> float:
-    """Return the mean change from one reading to the next along an axis."""
-    steps = np.abs(np.diff(frames, axis=axis))
-    return float(np.nanmean(steps)) if np.isfinite(steps).any() else 0.0
 
 
 def _classes_in_names(files: Sequence[Content]) -> str | None:

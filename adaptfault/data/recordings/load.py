@@ -336,7 +336,7 @@ def open_recordings(
     layout = shape if layout is None else layout
     array = given_array(layout) if layout is not None else layout_beside(given)
     tables = _calibration(calibration)
-    values = None if targets is None else TargetTable.read(Path(targets))
+    values = None if targets is None else TargetTable(Path(targets))
     tables_given = (layout, labels, calibration, targets)
     aside = {Path(p).resolve() for p in tables_given if isinstance(p, str | PathLike)}
     found, problems = find(given, readers(), aside)

@@ -28,6 +28,32 @@ _COUNTS = 16  # whole numbers that reach it are counts, in an array of decimals,
 _SAMPLE = 2000  # readings of a recording, in which the step of a converter is looked for
 
 
+class Gaps:
+    """Readings of some kind, as missing ones.
+
+    Args:
+        cells: D, how many cells there are.
+
+    Attributes:
+        count: int ``[D]``, how many there are of each cell.
+        first: int ``[D]``, frame of the first one, or line in a text.
+    """
+
+    def __init__(self, cells: int) -> None:
+        self.count = np.zeros(cells, np.int64)
+        self.first = np.zeros(cells, np.int64)
+
+    def add(self, gaps: NDArray[np.bool_], block: Block, before: int) -> None:
+        """Take in which readings ``[t, D]`` of the next frames are such; ``before``: frames of
+        those before."""
+        cells = np.flatnonzero(gaps.any(axis=0))
+        frames = gaps[:, cells].argmax(axis=0)
+        places = frames + before if block.lines is None else block.lines[frames]
+        new = self.count[cells] == 0
+        self.first[cells[new]] = places[new]
+        self.count[cells] += gaps[:, cells].sum(axis=0)
+
+
 @dataclass(eq=False)
 class Survey:
     """What one recording holds.
@@ -39,8 +65,7 @@ class Survey:
         whole: whether all readings are whole numbers.
         largest: finite reading.
         sample: finite readings above 0, evenly spaced in each block.
-        missing, infinite: number of such readings of each cell, ``[D]``.
-        first_missing, first_infinite: frame of the first one, or line in a text; ``[D]``.
+        missing, infinite: such readings.
         loaded, beyond: number of readings above 0, and above ``limit``.
         elapsed: of its clock; None without one.
         tick: unit of its clock.
@@ -53,10 +78,8 @@ class Survey:
     whole: bool = True
     largest: float = 0.0
     sample: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
-    missing: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
-    infinite: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
-    first_missing: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
-    first_infinite: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
+    missing: Gaps = field(default_factory=lambda: Gaps(0))
+    infinite: Gaps = field(default_factory=lambda: Gaps(0))
     loaded: int = 0
     beyond: int = 0
     elapsed: Elapsed | None = None
@@ -75,8 +98,8 @@ class Survey:
         if not self.length:
             self.head = np.asarray(values[:_HEAD], dtype=np.float64)
             self.first_line = 0 if block.lines is None else int(block.lines[0])
-            for name in ("missing", "infinite", "first_missing", "first_infinite"):
-                setattr(self, name, np.zeros(values.shape[1], np.int64))
+            self.missing = Gaps(values.shape[1])
+            self.infinite = Gaps(values.shape[1])
         whole_type = values.dtype.kind in "iu"
         measured = _measured(values)
         finite = measured if whole_type else measured[np.isfinite(measured)]
@@ -86,8 +109,8 @@ class Survey:
         self.beyond += int(np.count_nonzero(positive > self.limit))
         if not whole_type:
             self.whole = self.whole and bool(np.array_equal(finite, np.rint(finite)))
-            self._count("missing", np.isnan(values), block)
-            self._count("infinite", np.isinf(values), block)
+            self.missing.add(np.isnan(values), block, self.length)
+            self.infinite.add(np.isinf(values), block, self.length)
         room = _SAMPLE - len(self.sample)
         if room > 0:
             step = max(1, len(positive) // room)
@@ -98,17 +121,6 @@ class Survey:
             self.elapsed.add(block.times, block.lines)
             self.tick = block.tick
         self.length += len(values)
-
-    def _count(self, name: str, gaps: NDArray[np.bool_], block: Block) -> None:
-        cells = np.flatnonzero(gaps.any(axis=0))
-        if not len(cells):
-            return
-        frames = gaps[:, cells].argmax(axis=0)
-        places = frames + self.length if block.lines is None else block.lines[frames]
-        counts = getattr(self, name)
-        new = counts[cells] == 0
-        getattr(self, f"first_{name}")[cells[new]] = places[new]
-        counts[cells] += gaps[:, cells].sum(axis=0)
 
 
 def _measured(values: NDArray[Any]) -> NDArray[Any]:

@@ -172,6 +172,14 @@ class Places:
             part.reshape(len(mask), *sizes) for part, sizes in zip(parts, facts.sizes, strict=True)
         ]
 
+    def by_array(self, masks: Masks) -> dict[str, NDArray[np.bool_]]:
+        """Return the mask of each array, those of its recordings one behind the other."""
+        parts: dict[str, list[NDArray[np.bool_]]] = {}
+        for i, mask in enumerate(masks):
+            for name, part in zip(self.arrays[i], self.parts(i, mask), strict=True):
+                parts.setdefault(name, []).append(part)
+        return {name: np.concatenate(each) for name, each in parts.items()}
+
     def grid(self, mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """Return a mask as ``[T, pads, rows, cols]``."""
         return mask.reshape(-1, *self.layout.shape)
@@ -230,21 +238,15 @@ def column_of(pa: Any, mask: NDArray[np.bool_]) -> Any:
 
 def _zarr(path: Path, masks: Masks, names: Sequence[str], places: Places) -> None:
     zarr = imported("zarr", path)
+    every = list(masks)
     arrays: dict[str, NDArray[Any]] = {}
-    are_joined = len(set(places.arrays)) == 1
-    if places.are_own and not are_joined:
-        for i, mask in enumerate(masks):
-            for name, part in zip(places.arrays[i], places.parts(i, mask), strict=True):
-                arrays[f"{name}{VALID}"] = part
+    if places.are_own or len(set(places.arrays)) == 1:
+        by_array = places.by_array(iter(every))
+        arrays |= {f"{name}{VALID}": mask for name, mask in by_array.items()}
     else:
-        every = list(masks)
+        arrays["data/valid"] = places.grid(np.concatenate(every))
+    if not places.are_own or len(set(places.arrays)) == 1:
         arrays["meta/episode_ends"] = np.cumsum([len(mask) for mask in every])
-        if are_joined:
-            by_array = zip(*(places.parts(i, mask) for i, mask in enumerate(every)), strict=True)
-            for name, parts in zip(places.arrays[0], by_array, strict=True):
-                arrays[f"{name}{VALID}"] = np.concatenate(parts)
-        else:
-            arrays["data/valid"] = places.grid(np.concatenate(every))
     with atomic_folder(path, replaces=_is_ours(path)) as place:
         root = zarr.open_group(place, mode="w", zarr_format=2)
         root.attrs["schema"] = _SCHEMA

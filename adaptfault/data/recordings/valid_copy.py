@@ -122,13 +122,8 @@ def _by_array(
     """Return the mask of each array; ``held``: the arrays by name."""
     if not places.arrays:
         raise InputError.at(source, "holds readings without names; a copy needs them")
-    parts: dict[str, list[NDArray[np.bool_]]] = {}
-    for i, mask in enumerate(masks):
-        for name, part in zip(places.arrays[i], places.parts(i, mask), strict=True):
-            parts.setdefault(name, []).append(part)
     found: dict[str, NDArray[np.bool_]] = {}
-    for name, each in parts.items():
-        whole = np.concatenate(each)
+    for name, whole in places.by_array(masks).items():
         if whole.size != held[name].size:
             what = f"{name} holds {held[name].size} readings, of which {whole.size} were read"
             raise InputError.at(source, f"{what}; a copy needs all of them, in their order")

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import csv
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
+from typing import Literal
 
 from adaptfault.data.recordings.errors import InputError, Problem, located
 from adaptfault.data.recordings.formats.text import read_text
@@ -31,6 +32,47 @@ def natural_order(names: Iterable[str]) -> tuple[str, ...]:
     return tuple(sorted(set(names), key=natural_key))
 
 
+class FileTable:
+    """A table with a column ``file``, relative to its folder; lines that cannot be used are noted.
+
+    Attributes:
+        path: of the table.
+        header: as it is written.
+        columns: the same in lower case.
+        problems: what is wrong with single lines.
+
+    Raises:
+        InputError: the table cannot be read.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.header, self._lines = table_lines(path)
+        self.columns = [name.casefold() for name in self.header]
+        self.problems: list[Problem] = []
+
+    def rows(self, remedy: str) -> Iterator[tuple[int, Path, dict[str, str]]]:
+        """Yield the number of each line, its file, resolved, and its cells by column; ``remedy``:
+        of a line with another number of cells."""
+        for number, row in self._lines:
+            if len(row) != len(self.columns):
+                what = f"{len(row)} cells where the header has {len(self.columns)}"
+                self.note(number, f"{what}; {remedy}")
+                continue
+            cells = dict(zip(self.columns, row, strict=True))
+            name = cells["file"]
+            file = existing_file(self.path.parent, name)
+            if file is None:
+                what = f"names {name!r}, which is not there; correct the path or remove the line"
+                self.note(number, what)
+            else:
+                yield number, file, cells
+
+    def note(self, number: int, what: str, level: Literal["error", "warning"] = "error") -> None:
+        """Note what is wrong with a line."""
+        self.problems.append(Problem(level, located(self.path, what, f"line {number}")))
+
+
 def read_label_table(path: Path) -> tuple[dict[Path, str], list[Problem]]:
     """Read a table of the columns ``file`` and ``label``; files are relative to the table's folder.
 
@@ -40,50 +82,29 @@ def read_label_table(path: Path) -> tuple[dict[Path, str], list[Problem]]:
     Raises:
         InputError: the table cannot be read, or its header lacks a column.
     """
-    first, lines = table_lines(path)
-    header = [name.casefold() for name in first]
-    if not {"file", "label"} <= set(header):
+    table = FileTable(path)
+    if not {"file", "label"} <= set(table.columns):
         raise InputError.at(
             path, "expected a first line 'file,label', separated by commas; add it", "line 1"
         )
-    file_column = header.index("file")
-    label_column = header.index("label")
     labels: dict[Path, str] = {}
     conflicts: set[Path] = set()
-    problems: list[Problem] = []
-
-    def note(number: int, what: str, warning: bool = False) -> None:
-        problems.append(
-            Problem("warning" if warning else "error", located(path, what, f"line {number}"))
-        )
-
-    for number, row in lines:
-        if len(row) != len(header):
-            note(
-                number,
-                f"{len(row)} cells where the header has {len(header)}; give a file and its label",
-            )
+    for number, file, cells in table.rows("give a file and its label"):
+        name = cells["file"]
+        label = cells["label"]
+        before = labels.get(file, label)
+        if not label:
+            table.note(number, "the label is empty; give both")
             continue
-        name = row[file_column]
-        label = row[label_column]
-        if not name or not label:
-            note(number, f"the {'label' if name else 'file'} is empty; give both")
-            continue
-        file = existing_file(path.parent, name)
-        if file is None:
-            note(number, f"names {name!r}, which is not there; correct the path or remove the line")
-        elif file not in labels:
-            labels[file] = label
-        elif labels[file] == label:
-            note(number, f"{name!r} stands in the table twice; remove one line", warning=True)
-        else:
-            note(
-                number,
-                f"{name!r} is labelled {label!r} here and {labels[file]!r} before; left out, keep"
-                " one line",
-            )
+        if before != label:
+            what = f"{name!r} is labelled {label!r} here and {before!r} before; left out, keep"
+            table.note(number, f"{what} one line")
             conflicts.add(file)
-    return {file: label for file, label in labels.items() if file not in conflicts}, problems
+        elif file in labels:
+            table.note(number, f"{name!r} stands in the table twice; remove one line", "warning")
+        labels[file] = before
+    known = {file: label for file, label in labels.items() if file not in conflicts}
+    return known, table.problems
 
 
 def table_lines(path: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:

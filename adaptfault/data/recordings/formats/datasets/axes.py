@@ -18,6 +18,13 @@ from adaptfault.data.recordings.recording import Shape
 TURNED = "{} has the time as its last axis: read as frames of cells"
 """What is said of such an array."""
 
+DOUBTED = (
+    "frames have shape {}, and readings change less along the last axis than along any other: is"
+    " the last axis time? Expected [n, T, rows, cols]"
+)
+"""What is said where the axes of an array are those of recordings, and its last one looks like the
+time."""
+
 _SMOOTHER = 3.0  # times, that readings change less along the time than along any other axis
 _LONGEST = 40_000_000  # numbers that are looked at to find the time
 _SAMPLE = 1_000_000  # of them, where there are more rows
@@ -35,7 +42,7 @@ def is_time_last(path: Path, arrays: Mapping[str, Array], shape: Shape | None) -
     if any(len(one) < 2 for one in sizes):
         return False
     if shape is None:
-        if all(map(_is_smoothest_along_last, arrays.values())):
+        if all(map(is_smoothest_along_last, arrays.values())):
             raise InputError.at(path, _doubt(arrays))
         return False
     cells = math.prod(shape)
@@ -47,7 +54,7 @@ def is_time_last(path: Path, arrays: Mapping[str, Array], shape: Shape | None) -
     return sum(math.prod(one[:-1]) for one in sizes) == cells and not is_first
 
 
-def _is_smoothest_along_last(array: Array) -> bool:
+def is_smoothest_along_last(array: Array) -> bool:
     """Return whether readings change far less along the last axis, the longest one, than along any
     other: so they do from frame to frame."""
     sizes = tuple(map(int, array.shape))

@@ -36,7 +36,12 @@ from adaptfault.data.recordings.facts.roles import (
     shape_of,
     unit_of,
 )
-from adaptfault.data.recordings.formats.datasets.axes import TURNED, is_time_last
+from adaptfault.data.recordings.formats.datasets.axes import (
+    DOUBTED,
+    TURNED,
+    is_smoothest_along_last,
+    is_time_last,
+)
 from adaptfault.data.recordings.formats.datasets.beside import (
     Classes,
     Stated,
@@ -96,6 +101,7 @@ class Chooser:
         self.ends = next((name for name in arrays if last_part(name) in _ENDS), None)
         self.outer = False
         self.is_turned = False
+        self.is_doubted = False
         aside = (*EPISODES, *LABELS, *given_names(stated))
         self._beside: dict[str, list[str]] = {}
         for name in arrays:
@@ -138,7 +144,9 @@ class Chooser:
                 self.path, what if missing is None else f"holds no column {missing!r}"
             )
         first = found[0][1]
-        if not self.contents.is_table and self.known is None and not self._is_divided(first[0]):
+        if self._is_divided(first[0]):
+            self.is_doubted = is_smoothest_along_last(arrays[first[0]])
+        elif not self.contents.is_table and self.known is None:
             chosen_arrays = {name: arrays[name] for name in first}
             self.is_turned = is_time_last(self.path, chosen_arrays, self.shape)
         self.outer = not self.is_turned and self._holds_recordings(first)
@@ -273,6 +281,8 @@ class Chooser:
         told = []
         if self.is_turned:
             told.append(TURNED.format(part.names[0]))
+        if self.is_doubted:
+            told.append(DOUBTED.format(list(self.contents.arrays[part.names[0]].shape)))
         if pads.is_guessed:
             told.append(f"{', '.join(part.names)}: {GUESSED}")
         told += [division.lost for division in self.divisions if division.lost]

@@ -22,13 +22,12 @@ from numpy.typing import NDArray
 
 from adaptfault.data.recordings.errors import InputError
 from adaptfault.data.recordings.facts.labels import natural_key
-from adaptfault.data.recordings.facts.roles import readings
+from adaptfault.data.recordings.facts.roles import TOUCH, readings
 from adaptfault.data.recordings.recording import Shape
 
 VALID = ".valid"
 """What the name of a mask has behind that of the array whose valid readings it tells."""
 
-_TOUCH = re.compile(r"tactile|taxel|pressure|touch|skin|fsr", re.IGNORECASE)
 _NO_TOUCH = re.compile(
     r"temp|time|stamp|valid|mask|index|image|rgb|depth|video|calib", re.IGNORECASE
 )
@@ -114,7 +113,7 @@ def _without_episode(name: str) -> str:
 
 def is_touch(name: str) -> bool:
     """Return whether a feature holds touch by its name."""
-    return _TOUCH.search(name) is not None and _NO_TOUCH.search(name) is None
+    return TOUCH.search(name) is not None and _NO_TOUCH.search(name) is None
 
 
 def is_no_touch(name: str) -> bool:
@@ -126,7 +125,7 @@ def _by_word(features: Mapping[str, Sizes]) -> dict[str, list[str]]:
     """Return the features of touch by the word that tells it, in natural order."""
     words: dict[str, list[str]] = {}
     for name in sorted(features, key=natural_key):
-        word = _TOUCH.search(name)
+        word = TOUCH.search(name)
         if word and is_touch(name):
             words.setdefault(word[0].lower(), []).append(name)
     return words

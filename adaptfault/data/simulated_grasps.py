@@ -188,19 +188,7 @@ def simulate(
         ValueError: a number below its least, a class unknown or named twice, none at all, a layout
             with several axes.
     """
-    for name, number, least in (
-        ("n_per_class", n_per_class, 1),
-        ("n_frames", n_frames, 1),
-        ("seed", seed, 0),
-        ("sensor_seed", sensor_seed, 0),
-    ):
-        if not isinstance(number, int | np.integer) or isinstance(number, bool) or number < least:
-            raise ValueError(f"simulate needs {name} >= {least}, a whole number; got {number!r}")
-    named = [] if isinstance(classes, str) else list(classes)
-    if not named or len(set(named)) < len(named) or set(named) - set(CLASS_NAMES):
-        raise ValueError(
-            f"classes must name some of {', '.join(CLASS_NAMES)}, each once; got {classes!r}"
-        )
+    _check(classes, n_per_class=n_per_class, n_frames=n_frames, seed=seed, sensor_seed=sensor_seed)
     layout = SensorLayout.paper() if layout is None else layout
     if layout.axes > 1:
         raise ValueError(
@@ -221,6 +209,19 @@ def simulate(
     names = tuple(f"{name}/{i:04d}" for name in classes for i in range(n_per_class))
     labels = np.repeat(np.arange(len(classes)), n_per_class)
     return Recordings(tuple(frames), layout, labels, tuple(classes), names)
+
+
+def _check(classes: Sequence[str], **numbers: int) -> None:
+    """Raise ValueError where :func:`simulate` cannot take classes, or a number."""
+    for name, number in numbers.items():
+        least = 1 if name.startswith("n_") else 0
+        if not isinstance(number, int | np.integer) or isinstance(number, bool) or number < least:
+            raise ValueError(f"simulate needs {name} >= {least}, a whole number; got {number!r}")
+    named = [] if isinstance(classes, str) else list(classes)
+    if not named or len(set(named)) < len(named) or set(named) - set(CLASS_NAMES):
+        raise ValueError(
+            f"classes must name some of {', '.join(CLASS_NAMES)}, each once; got {classes!r}"
+        )
 
 
 def _grasp(
@@ -303,14 +304,11 @@ def _faces(
     unit = np.sqrt(layout.rows * layout.cols / 110)  # one pitch on the paper's pad
     row, col = _positions(layout)
     # the softer it is, the further it bulges between the pads
-    a, b = (
-        0.34 * m * rng.normal(1, 0.03, one) * STIFFNESS.get(name, 1.0) ** -0.08
-        for m in (layout.rows, layout.cols)
-    )
-    x0, y0 = (
-        rng.normal(0, 0.06 * m, one) + rng.normal(0, 0.15 * unit, face)
-        for m in (layout.rows, layout.cols)
-    )
+    softness = STIFFNESS.get(name, 1.0) ** -0.08
+    a = 0.34 * layout.rows * rng.normal(1, 0.03, one) * softness
+    b = 0.34 * layout.cols * rng.normal(1, 0.03, one) * softness
+    x0 = rng.normal(0, 0.06 * layout.rows, one) + rng.normal(0, 0.15 * unit, face)
+    y0 = rng.normal(0, 0.06 * layout.cols, one) + rng.normal(0, 0.15 * unit, face)
     angle = rng.normal(0, 0.12, one)
     bow = rng.normal(0.05, 0.04, face)
     many = (40, *face)
@@ -333,10 +331,7 @@ def _faces(
         height = bow * (1 - (x / a) ** 2 - (y / b) ** 2)
         for wave, h, p in zip(length, heading, phase, strict=True):
             height += texture * np.cos(2 * np.pi / wave * (np.cos(h) * x + np.sin(h) * y) + p)
-        # the corners are rounded by one unit
-        qx = np.abs(x) - a + unit
-        qy = np.abs(y) - b + unit
-        outline = np.hypot(qx.clip(0), qy.clip(0)) + np.maximum(qx, qy).clip(None, 0) - unit
+        outline = _outline(np.abs(x) - a + unit, np.abs(y) - b + unit) - unit
         stiffness = np.ones_like(x)
         if name in INCLUSION:
             spot = np.exp(-((x - defect_x) ** 2 + (y - defect_y) ** 2) / (2 * radius**2))
@@ -347,14 +342,8 @@ def _faces(
             outline = np.where(kind == 0, np.maximum(outline, cut * np.minimum(a, b)), outline)
             across = np.where(strength > 1.05, x - defect_x, y - defect_y)
             height -= (kind == 1) * strength * np.exp(-(across**2) / (2 * radius**2))
-            height += (
-                (kind == 2)
-                * 0.55
-                * strength
-                * np.sign(defect_x)
-                * _facing(layout.pads)
-                * (1 - 2 * (x / a) ** 2)
-            )
+            side = np.sign(defect_x) * _facing(layout.pads)
+            height += (kind == 2) * 0.55 * strength * side * (1 - 2 * (x / a) ** 2)
         edge = outline / (EDGE * unit)
         height -= EDGE_DROP * (edge + 1).clip(0) ** 2
         return stiffness * (1 + 0.3 * np.exp(-2 * (edge + 0.8) ** 2)), height
@@ -363,6 +352,11 @@ def _faces(
     stiffness, before = surface(still, still, still)
     slip = rng.normal(0, 0.3 * unit, one), rng.normal(0, 0.3 * unit, one), rng.normal(0, 0.03, one)
     return stiffness, before, surface(*slip)[1]
+
+
+def _outline(x: Array, y: Array) -> Array:
+    """Return how far places are outside a corner at 0, which is round; negative: inside."""
+    return np.asarray(np.hypot(x.clip(0), y.clip(0)) + np.maximum(x, y).clip(None, 0))
 
 
 def _balance(height: Array, stiffness: Array) -> Array:

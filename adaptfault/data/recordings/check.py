@@ -190,6 +190,29 @@ class OutOfRange:
         return Problem("warning", located(self.content.path, what))
 
 
+def out_of_range(found: list[Problem], files: int, layout: SensorLayout) -> list[Problem]:
+    """Return the warnings about the range; one for all where most files have it, because then the
+    scale is wrong."""
+    if len(found) <= max(3, files // 2):
+        return found
+    what = (
+        f"{len(found)} of {files} files hold readings outside 0..{layout.full_scale:g}"
+        f" {layout.unit}: check the layout's full scale and unit; the first is"
+    )
+    return [Problem("warning", f"{what} {found[0].message}")]
+
+
+def clamped_readings(clamped: NDArray[np.int64]) -> Problem:
+    """Return the warning about readings below and above the tables, ``[2, D]``."""
+    below, above = (int(n) for n in clamped.sum(axis=1))
+    cells = int(clamped.any(axis=0).sum())
+    what = (
+        f"{below} readings below and {above} above the tables of {cells} cells, most on cell"
+        f" {int(clamped.sum(axis=0).argmax())}: clamped to the tables' ends"
+    )
+    return Problem("warning", f"calibration: {what}")
+
+
 def other_lengths(contents: Sequence[Content]) -> list[Problem]:
     """Warn of each file of another length, if there are at least 3 files and at least 9 in 10 share
     one length.

@@ -113,3 +113,12 @@ def _below(root: Path, known: Mapping[str, Reader], problems: list[Problem]) -> 
     for path, reader in files:
         if path not in (table, root / TARGETS):
             yield Found(path, path.relative_to(root).as_posix(), root, reader, labels)
+
+
+def passed_over(notes: Sequence[Path]) -> list[Problem]:
+    """Return one warning for all files that hold no line of numbers."""
+    if not notes:
+        return []
+    more = f", and {len(notes) - 1} more" if len(notes) > 1 else ""
+    what = f"is no recording, it holds no line of numbers: passed over{more}"
+    return [Problem("warning", located(notes[0], what))]

@@ -22,12 +22,14 @@ from adaptfault.data.recordings.check import (
     check_readings,
     check_scale,
     check_width,
+    clamped_readings,
     other_lengths,
+    out_of_range,
     without_infinite,
 )
 from adaptfault.data.recordings.dataset import Recordings
 from adaptfault.data.recordings.doubts import copies, doubts
-from adaptfault.data.recordings.errors import InputError, Problem, foreseeing, located
+from adaptfault.data.recordings.errors import InputError, Problem, foreseeing
 from adaptfault.data.recordings.facts.classes import class_indices, label_files
 from adaptfault.data.recordings.facts.infer import PAPER, SLACK
 from adaptfault.data.recordings.facts.layout_file import LAYOUT_NAME, layout_beside, not_stated
@@ -39,7 +41,7 @@ from adaptfault.data.recordings.facts.resolve import (
     resolve_layout,
 )
 from adaptfault.data.recordings.facts.targets import TargetTable, target_files
-from adaptfault.data.recordings.files import Found, find
+from adaptfault.data.recordings.files import Found, find, passed_over
 from adaptfault.data.recordings.readers import check_stated, readers
 from adaptfault.data.recordings.recording import BLOCK, Shape
 from adaptfault.data.recordings.survey import Content, Surveyor
@@ -222,9 +224,9 @@ class Opened:
             problem = range_.problem()
             if problem is not None:
                 outside.append(problem)
-        late = _summary(outside, len(self._contents), self.layout)
+        late = out_of_range(outside, len(self._contents), self.layout)
         if clamped.any():
-            late.append(_clamped(clamped))
+            late.append(clamped_readings(clamped))
         self.late_problems = tuple(late)
 
     def _blocks(
@@ -403,7 +405,7 @@ def _surveyed(
                     notes.append(file.path)
         except InputError as error:
             problems.append(Problem("error", str(error)))
-    problems += _passed_over(notes)
+    problems += passed_over(notes)
     return contents
 
 
@@ -445,15 +447,6 @@ def _usable(
     return usable
 
 
-def _passed_over(notes: Sequence[Path]) -> list[Problem]:
-    """Return one warning for all files that hold no line of numbers."""
-    if not notes:
-        return []
-    more = f", and {len(notes) - 1} more" if len(notes) > 1 else ""
-    what = f"is no recording, it holds no line of numbers: passed over{more}"
-    return [Problem("warning", located(notes[0], what))]
-
-
 def _calibration(calibration: Calibration | PathName | None) -> Calibration | None:
     if not isinstance(calibration, str | PathLike):
         return calibration
@@ -461,28 +454,6 @@ def _calibration(calibration: Calibration | PathName | None) -> Calibration | No
     from adaptfault.data.calibration import Calibration
 
     return Calibration.read(calibration)
-
-
-def _clamped(clamped: NDArray[np.int64]) -> Problem:
-    below, above = (int(n) for n in clamped.sum(axis=1))
-    cells = int(clamped.any(axis=0).sum())
-    what = (
-        f"{below} readings below and {above} above the tables of {cells} cells, most on cell"
-        f" {int(clamped.sum(axis=0).argmax())}: clamped to the tables' ends"
-    )
-    return Problem("warning", f"calibration: {what}")
-
-
-def _summary(out_of_range: list[Problem], files: int, layout: SensorLayout) -> list[Problem]:
-    """Return the warnings about the range; one for all where most files have it, because then the
-    scale is wrong."""
-    if len(out_of_range) <= max(3, files // 2):
-        return out_of_range
-    what = (
-        f"{len(out_of_range)} of {files} files hold readings outside 0..{layout.full_scale:g}"
-        f" {layout.unit}: check the layout's full scale and unit; the first is"
-    )
-    return [Problem("warning", f"{what} {out_of_range[0].message}")]
 
 
 def nothing_left(problems: Sequence[Problem]) -> InputError:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from adaptfault.data.recordings import InputError, load
+from adaptfault.data.recordings.formats import csv_folder, spans
 from diagnostics import SensorLayout
 
 SDH = Path(__file__).parents[2] / "shared/data/sdh2x13x6_grasps36.npz"
@@ -50,3 +51,11 @@ def counts(n=3, frames=8, shape=(1, 2, 3), highest=1023):
     values = rng.integers(0, highest, (n, frames, *shape)).astype(np.uint16)
     values[0, 0].flat[0] = highest
     return values
+
+
+def csv_blocks(path, size=2_000_000):
+    """The frames of a table, about so many bytes of text at a time."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(spans, "PIECE", size)
+        for recording in csv_folder.open(path):
+            yield from recording.blocks()

@@ -4,11 +4,10 @@ import sys
 
 import numpy as np
 import pytest
-from recording_files import PAPER, messages, newtons, refusal, rng, text, write
+from recording_files import PAPER, csv_blocks, messages, newtons, refusal, rng, text, write
 
 from adaptfault.data.recordings import load
 from adaptfault.data.recordings.errors import InputError
-from adaptfault.data.recordings.formats.csv_folder import csv_blocks
 from diagnostics import SensorLayout
 
 

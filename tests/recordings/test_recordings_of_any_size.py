@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from recording_files import csv_blocks
 
 from adaptfault.cli import main
 from adaptfault.data.recordings import (
@@ -17,8 +18,7 @@ from adaptfault.data.recordings import (
     open_recordings,
     save_npz,
 )
-from adaptfault.data.recordings.formats import csv_folder
-from adaptfault.data.recordings.formats.csv_folder import csv_blocks
+from adaptfault.data.recordings.formats import spans
 from adaptfault.data.recordings.load import Opened
 from diagnostics import SensorLayout
 
@@ -67,7 +67,7 @@ def test_a_log_of_any_size_is_diagnosed_alike(tmp_path, log, kind, monkeypatch, 
         if size is not None:
             monkeypatch.setattr(Opened.parts, "__defaults__", (size,))
             monkeypatch.setitem(open_recordings.__kwdefaults__, "room", 0)
-            monkeypatch.setattr(csv_folder, "PIECE", 100_000)
+            monkeypatch.setattr(spans, "PIECE", 100_000)
         shape = [] if kind in ("npz", "bag") else ["--shape", "2x11x10"]
         assert main(["diagnose", folder, "--json", *shape]) == 2
         said.append(json.loads(capsys.readouterr().out))

@@ -6,12 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from recording_files import messages, newtons, refusal, rng, text, write
+from recording_files import csv_blocks, messages, newtons, refusal, rng, text, write
 
 from adaptfault.cli import main
 from adaptfault.data.recordings import load
 from adaptfault.data.recordings.formats import csv_folder, matrices
-from adaptfault.data.recordings.formats.csv_folder import csv_blocks
 
 VALUES = rng.uniform(0.1, 4.9, (30, 6)).round(3)
 NAMES = ",".join(f"c{i}" for i in range(6))
@@ -596,7 +595,6 @@ def test_a_column_of_episodes_divides_a_table(tmp_path, encoding, end, monkeypat
     file.write_bytes(file.read_text().replace("\n", end).encode(encoding))
     for size in (2_000_000, 97):
         monkeypatch.setattr("adaptfault.data.recordings.formats.spans.PIECE", size)
-        monkeypatch.setattr("adaptfault.data.recordings.formats.csv_folder.PIECE", size)
         recordings = load(file, layout="2x3").recordings
         assert [name.rpartition(" ")[2] for name in recordings.names] == ["7", "8", "3"]
         assert [recordings.class_names[i] for i in recordings.labels] == ["a", "b", "a"]

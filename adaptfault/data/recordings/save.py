@@ -15,6 +15,7 @@ from adaptfault.data.atomic import atomic_write
 from adaptfault.data.recordings.dataset import Recordings
 from adaptfault.data.recordings.errors import InputError
 from adaptfault.data.recordings.facts.layout_file import LAYOUT_NAME
+from adaptfault.data.recordings.formats.datasets.extra import imported
 from adaptfault.data.recordings.formats.npz import save_npz
 from adaptfault.data.recordings.recording import DECLARED
 from diagnostics import SensorLayout
@@ -138,16 +139,12 @@ def _folders(names: Sequence[str]) -> list[str]:
 
 
 def _save_bag(path: Path, recordings: Recordings) -> tuple[str, ...]:
-    try:
-        from rosbags.rosbag2 import StoragePlugin, Writer
-        from rosbags.typesys import Stores, get_typestore
-    except ImportError:
-        raise InputError.at(
-            path, "bags are written with rosbags; install it: pip install 'adaptfault[ros]'"
-        ) from None
+    what = "bags are written with rosbags; install it: pip install 'adaptfault[ros]'"
+    rosbag2 = imported("rosbags.rosbag2", path, what)
+    typesys = imported("rosbags.typesys", path, what)
     if path.exists():
         raise InputError.at(path, "exists; choose another name")
-    store = get_typestore(Stores.ROS2_HUMBLE)
+    store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
     kinds = store.types
     sizes = recordings.layout.shape
     dim = kinds["std_msgs/msg/MultiArrayDimension"]
@@ -159,9 +156,8 @@ def _save_bag(path: Path, recordings: Recordings) -> tuple[str, ...]:
     about = kinds["std_msgs/msg/MultiArrayLayout"](dim=dims, data_offset=0)
     period = round(1e9 / recordings.layout.rate)
     at = _BEGIN * 10**9
-    with Writer(
-        path, version=8, storage_plugin=StoragePlugin.MCAP
-    ) as writer:  # ROS 2 Humble rejects version 9
+    mcap = rosbag2.StoragePlugin.MCAP
+    with rosbag2.Writer(path, version=8, storage_plugin=mcap) as writer:  # Humble rejects version 9
         connection = writer.add_connection(_TOPIC, _KIND, typestore=store)
         for frames in recordings:
             for frame in frames:

@@ -20,6 +20,7 @@ from adaptfault.data.recordings.facts.sizes import check_kind
 from adaptfault.data.recordings.formats.bag_fields import Found, Topic, choose
 from adaptfault.data.recordings.formats.bag_frames import NEAR, Frames, Message
 from adaptfault.data.recordings.formats.bag_salvage import Salvage
+from adaptfault.data.recordings.formats.datasets.extra import imported
 from adaptfault.data.recordings.formats.datasets.features import Pads
 from adaptfault.data.recordings.recording import BLOCK, Block, Facts, Recording, Shape
 
@@ -65,7 +66,7 @@ def open(
             clear.
     """
     problems: list[Problem] = []
-    source = partial(bag_messages, path, shape=shape, topic=topic, field=field)
+    source = partial(_messages, _Asked(path, shape, topic, field))
     messages = source(problems)
     first = next(messages, None)
     if first is None:
@@ -91,7 +92,7 @@ def open(
     )
 
     def blocks(begin: int, end: int) -> Callable[[], Iterator[Block]]:
-        return lambda: _blocks(source([], begin=begin, end=end), width)
+        return lambda: _blocks(source([], begin, end), width)
 
     return [Recording(facts, blocks(int(part[0]), int(part[-1]) + 1)) for part in _parts(stamps)]
 
@@ -115,37 +116,24 @@ def _blocks(messages: Iterator[Message], width: int) -> Iterator[Block]:
         yield Block(np.stack([message.values for message in whole]), None, times, "ns")
 
 
-def bag_messages(
-    path: Path,
-    problems: list[Problem],
-    *,
-    shape: Shape | None = None,
-    topic: str | None = None,
-    field: str | None = None,
-    begin: int | None = None,
-    end: int | None = None,
+def _messages(
+    asked: _Asked, problems: list[Problem], begin: int | None = None, end: int | None = None
 ) -> Iterator[Message]:
     """Yield the readings of a bag message by message, in constant memory.
 
     Args:
-        path: the bag.
+        asked: what is read of which bag.
         problems: missing parts are added to them.
-        shape, topic, field: as for :func:`open`.
         begin, end: times in nanoseconds, ``begin`` included; None: all.
 
     Raises:
         InputError: as :func:`open`.
     """
-    try:
-        import mcap  # noqa: F401  for bags that are damaged, and for JSON
-        import rosbags  # noqa: F401
-    except ImportError:
-        raise InputError.at(
-            path, "bags are read with rosbags; install it: pip install 'adaptfault[ros]'"
-        ) from None
-    for file in _files(path):
+    what = "bags are read with rosbags; install it: pip install 'adaptfault[ros]'"
+    for package in ("mcap", "rosbags"):  # the former for bags that are damaged, and for JSON
+        imported(package, asked.path, what)
+    for file in _files(asked.path):
         check_kind(file)
-    asked = _Asked(path, shape, topic, field)
     given = 0
 
     def is_within(message: Message) -> bool:

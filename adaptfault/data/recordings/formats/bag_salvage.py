@@ -36,10 +36,6 @@ class Salvage:
         self.skipped = 0
         return self._mcap() if self.path.suffix.lower() == ".mcap" else self._sqlite()
 
-    def topics(self) -> list[Topic]:
-        """Return the topics that still have messages."""
-        return list(dict.fromkeys(topic for topic, _, _ in self))
-
     def _mcap(self) -> Iterator[Found]:
         from mcap.records import Channel, Chunk, Message, Schema
         from mcap.stream_reader import StreamReader, breakup_chunk

@@ -46,7 +46,7 @@ from adaptfault.data.recordings.formats.dialect import (
 )
 from adaptfault.data.recordings.formats.matrices import matrices
 from adaptfault.data.recordings.formats.rows import parse_rows
-from adaptfault.data.recordings.formats.spans import PIECE, Span, cell_of, pieces, spans_of
+from adaptfault.data.recordings.formats.spans import Span, cell_of, pieces, spans_of
 from adaptfault.data.recordings.formats.text import (
     LATIN,
     check_text,
@@ -116,22 +116,9 @@ def open(
     )
 
     def blocks(span: Span) -> Callable[[], Iterator[Block]]:
-        return lambda: _blocks(path, dialect, held, PIECE, span)
+        return lambda: _blocks(path, dialect, held, span)
 
     return [Recording(facts, blocks(span), span.name, span.label) for span in spans]
-
-
-def csv_blocks(path: Path, size: int = PIECE) -> Iterator[Block]:
-    """Yield the frames of a table, about ``size`` bytes of text at a time.
-
-    Raises:
-        InputError: as :func:`open`, once the place is reached.
-    """
-    check_text(path)
-    dialect = find_dialect(path)
-    if dialect is None:
-        raise _no_numbers(path)
-    yield from _blocks(path, dialect, choose_columns(path, dialect), size, Span())
 
 
 def _no_numbers(path: Path) -> InputError:
@@ -168,14 +155,12 @@ class _Before:
         return _Before(self.lines + piece.count(b"\n"), last.decode("utf-8", LATIN))
 
 
-def _blocks(
-    path: Path, dialect: Dialect, columns: Columns, size: int, span: Span
-) -> Iterator[Block]:
+def _blocks(path: Path, dialect: Dialect, columns: Columns, span: Span) -> Iterator[Block]:
     before = _Before(span.lines)
     rest = b""
     length = 0
     try:
-        for data, is_last in pieces(path, dialect, size, span.begin, span.end):
+        for data, is_last in pieces(path, dialect, span.begin, span.end):
             rest += data
             cut = len(rest) if is_last else rest.rfind(b"\n") + 1
             piece = rest[:cut]

@@ -20,10 +20,8 @@ from adaptfault.data.recordings.formats.dialect import (
     numbered,
 )
 from adaptfault.data.recordings.formats.rows import parse_rows
+from adaptfault.data.recordings.formats.spans import PIECE
 from adaptfault.data.recordings.recording import Block, Facts, Recording
-
-PIECE = 2_000_000
-"""Characters of text that are parsed at once."""
 
 _END = "@@"
 _LONGEST_UNIT = 16
@@ -83,8 +81,8 @@ def _unit(written: str) -> str | None:
     return written if 0 < len(written) <= _LONGEST_UNIT and len(written.split()) == 1 else None
 
 
-def matrix_blocks(path: Path, dialect: Dialect, size: int = PIECE) -> Iterator[Block]:
-    """Yield the frames of a file, about ``size`` characters of text at a time.
+def matrix_blocks(path: Path, dialect: Dialect) -> Iterator[Block]:
+    """Yield the frames of a file, about :data:`.spans.PIECE` characters of text at a time.
 
     Raises:
         InputError: a frame has another number of lines than the first, or a line another number of
@@ -108,7 +106,7 @@ def matrix_blocks(path: Path, dialect: Dialect, size: int = PIECE) -> Iterator[B
             raise InputError.at(path, what, at)
         held += frame
         length += sum(len(line) for _, line in frame)
-        if length > size:
+        if length > PIECE:
             yield _block(path, held, dialect)
             held = []
             length = 0

@@ -72,7 +72,7 @@ def spans_of(path: Path, dialect: Dialect, columns: Columns) -> tuple[list[Span]
 
 
 def pieces(
-    path: Path, dialect: Dialect, size: int, begin: int = 0, end: int | None = None
+    path: Path, dialect: Dialect, begin: int = 0, end: int | None = None
 ) -> Iterator[tuple[bytes, bool]]:
     """Yield the bytes of a file from ``begin`` to ``end``, as UTF-8, and whether they are the last:
     behind zero bytes nothing is data."""
@@ -81,8 +81,8 @@ def pieces(
     with builtins.open(path, "rb") as file:
         at = 0 if is_wide else file.seek(begin)
         while True:
-            data = file.read(size)
-            is_last = len(data) < size
+            data = file.read(PIECE)
+            is_last = len(data) < PIECE
             if is_wide:
                 data = decoder.decode(data).encode("utf-8", "replace")
             before = at
@@ -110,7 +110,7 @@ def _rows(path: Path, dialect: Dialect) -> Iterator[tuple[int, int, str]]:
     number = 0
     begin = 0
     rest = b""
-    for data, is_last in pieces(path, dialect, PIECE):
+    for data, is_last in pieces(path, dialect):
         *lines, rest = (rest + data.partition(b"\0")[0]).split(b"\n")
         if is_last:
             lines.append(rest)

@@ -7,6 +7,9 @@ A reader is a module (or any object) with::
     def open(path, **stated): -> Iterable[Recording]
     def accepts(path): -> bool                      # optional: whether a folder is one of its own
 
+Where a file holds arrays by name, what opens it is enough: ``formats.datasets.reader.reader`` makes
+``open`` of it, and finds readings, times, episodes and classes.
+
 ``stated`` is what the user says about the files: ``shape``, ``key``, ``topic``, ``columns`` and
 what else the reader asks for; it ignores the rest. A file that turns out to be none of its format,
 as notes that end in ``.txt``, gives no recording. A package that declares such an entry point is

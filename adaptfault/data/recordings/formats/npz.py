@@ -97,9 +97,9 @@ def open(path: Path, *, shape: Shape | None = None, **stated: Any) -> list[Recor
         what = f"array 'names' has {len(names)} entries for {len(recordings)} recordings"
         raise InputError.at(path, f"{what}; give one each")
     present = _present(path, arrays, facts)
-    stated = {"full_scale": _in_counts(beside.get("full_scale"))}
-    stated["rate"] = next((beside[key] for key in _RATES if key in beside), None)
-    for key, value in stated.items():
+    numbers = {"full_scale": _in_counts(beside.get("full_scale"))}
+    numbers["rate"] = next((beside[key] for key in _RATES if key in beside), None)
+    for key, value in numbers.items():
         if isinstance(value, str):
             what = f"{key} is {shown(value)}, no number: ignored"
             problems = (*problems, Problem("warning", located(path.with_suffix(".json"), what)))
@@ -109,8 +109,8 @@ def open(path: Path, *, shape: Shape | None = None, **stated: Any) -> list[Recor
         numbered=numbered,
         shape=facts.shape if present is None else present.shape,
         present=present,
-        full_scale=_scalar(path, arrays, "full_scale", stated["full_scale"]),
-        rate=_scalar(path, arrays, "rate", stated["rate"]),
+        full_scale=_scalar(path, arrays, "full_scale", numbers["full_scale"]),
+        rate=_scalar(path, arrays, "rate", numbers["rate"]),
         unit=_unit(arrays, beside),
         declared=_declared(arrays.get("layout")) | _device(arrays.get("device")),
         problems=(*problems, *facts.problems),

@@ -631,6 +631,9 @@ class SelfDiagnosis:
         aliases, _ = find_aliasing(stream)
         judgement, still = judged_with_objects(model, stream.record(), self._planes)
         found = findings(judgement, stream, self.layout.full_scale, self.false_discovery_rate)
+        # what a pad shares looks alike on lines that nothing touches
+        doubtful = (found.probability >= DOUBTED)[self._place]
+        aliases = [fault for fault in aliases if doubtful[list(fault.cells)].any()]
         evidence = {
             "spatial": found.weight,
             "temporal": np.zeros(len(found.weight)),

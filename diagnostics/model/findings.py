@@ -43,6 +43,8 @@ def findings(
     frames = stream.intermittency
     blinks = frames.intermittent & delivers
     noisy = frames.excess & delivers
+    if log.step:  # of a coarser converter: loads come and go in one
+        blinks = np.zeros_like(blinks)
     if judgement.disturbed:
         faulty = faulty & (log.run >= HELD)
         probability = np.where(delivers & ~faulty, np.minimum(probability, 0.5), probability)

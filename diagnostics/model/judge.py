@@ -7,7 +7,8 @@ as the others say join them. With w the ways to fail and their evidence E_w,
     log odds = log (p / (1 - p)) + log sum over w of  prior_w exp(E_w)
 
 where the prevalence p is that of the log (EM, shrunk to a usual one). Where many of the cells that
-move are refuted, the whole array does what the reference never saw: nobody is blamed for it.
+move are refuted, or trusted ones are odd again and again, the whole array does what the reference
+never saw: nobody is blamed for it.
 """
 
 from __future__ import annotations
@@ -43,6 +44,8 @@ _ITERATIONS = 10
 _EXPLAINS = 0.5  # of the evidence of any way: a value that is held
 _DISTURBED = 1 / 3  # of the cells that move
 _FEWEST = 8  # cells that show a disturbance
+_MOST_CELLS = 0.75  # of those that are trusted: so many are less odd than
+_STRANGE = 10.0  # times as often as usual
 # of a log: what is kept of all cells, but no fewer pieces
 _MOST_READINGS = 500_000
 _FEWEST_PIECES = 512
@@ -63,8 +66,8 @@ class Judgement:
         observed: what these say of the log.
         units: of the log.
         failing: lines and groups that fail now and then.
-        disturbed: share of the cells that move which are refuted, where it is so large that none of
-            them is faulty; else 0.
+        disturbed: share of the cells that move which are refuted, or of the units in which trusted
+            cells are odd, where it is so large that no cell that moves is faulty; else 0.
     """
 
     evidence: Array
@@ -201,7 +204,7 @@ class Model:
             observed=observed,
             units=units,
             failing=failing,
-            disturbed=self._disturbed(log, probability, log.far & ~failing.cells),
+            disturbed=self._disturbed(observed, probability, log.far & ~failing.cells),
         )
 
     def moving(self, log: Log) -> Mask:
@@ -261,11 +264,16 @@ class Model:
         return found
 
     @staticmethod
-    def _disturbed(log: Log, probability: Floats, alone: Mask) -> float:
-        """Return the share of the cells that move ``alone`` (bool ``[D]``) which are refuted."""
-        refuted = alone & (log.run < HELD) & (probability > 0.5)
+    def _disturbed(observed: Observed, probability: Floats, alone: Mask) -> float:
+        """Return the share of the cells that move ``alone`` (bool ``[D]``) which are refuted, or of
+        the units in which trusted cells are odd."""
+        refuted = alone & (observed.log.run < HELD) & (probability > 0.5)
         share = float(refuted.sum() / max(1, alone.sum()))
-        return share if refuted.sum() >= _FEWEST and share > _DISTURBED else 0.0
+        if refuted.sum() >= _FEWEST and share > _DISTURBED:
+            return share
+        odd = observed.odd[:, observed.known].mean(axis=0)
+        strange = float(np.quantile(odd, _MOST_CELLS)) if len(odd) >= _FEWEST else 0.0
+        return strange if strange > _STRANGE * USUAL else 0.0
 
 
 def _of_any(evidence: Array, ways: Sequence[Way]) -> Array:

@@ -22,6 +22,7 @@ from diagnostics.model.symbols import (
 
 _ODD = 5.0  # nats of a unit beyond those expected
 _LOOKS = np.log([[0.95, 0.03, 0.02], [0.1, 0.88, 0.02]])  # of a held value without and with dither
+_USUALLY = 8.0  # cells that the usual look of a piece is worth
 _LEAST = 1e-6  # probability whose logarithm is taken
 
 
@@ -33,9 +34,11 @@ class Log:
         received: bool ``[D]``, cells that deliver readings.
         far: bool ``[D]``, those that move by more than a dither.
         above: readings above rest ``[n, D]``, without what the pad shares.
+        step: of the converter, where it is coarser than that of the reference; else 0.
         load: root loads ``[n, D]``.
         level, flat, before: int ``[n, D]``.
-        either: int8 ``[3, n, D]``, levels that a reading may have: near the edge of one, either.
+        agree: log P(two readings of this level agree) ``[n, D]``.
+        either: int8 ``[shifts, n, D]``, levels that a reading may have: near an edge, either.
         value: ``[D]``, reading at the end.
         holds: bool ``[n, D]``, pieces at this value.
         run: int ``[D]``, of them, up to the end.
@@ -50,11 +53,17 @@ class Log:
         self.received = present & record.received.any(axis=0)
         self.far = self.received & (highest - lowest > DITHER * rest.full)
         self.above = rest.above(record, living & self.received)
+        unsure, self.step = rest.unsure(record, self.above, living & self.received)
+        wider = unsure > rest.near
+        self.above = np.where(wider & (np.abs(self.above) <= unsure), 0, self.above)
         self.load = root_load(self.above, rest)
-        doubt = rest.near / 2
-        shifts = (0.0, -doubt, doubt)
+        doubt = np.where(wider, unsure, rest.near / 2)
+        shifts = [np.zeros_like(doubt), -doubt, doubt]
+        if wider.any():
+            shifts += [-doubt / 2, doubt / 2]
         self.either = np.stack([symbols.levels(record, self.above + shift) for shift in shifts])
         self.level: NDArray[np.int8] = self.either[0]
+        self.agree = np.log(symbols.agree(self.step))[self.level]
         self.flat = symbols.flat(record)
         self.before = before_of(self.flat, record)
         self.value = (record.low[-1] + record.high[-1]) / 2
@@ -91,6 +100,7 @@ class Observed:
         of_level: log P(observed level) ``[n, D]``.
         of_flatness: log P(observed flatness | level, how many others move) ``[n, D]``.
         alone: log P(observed level) ``[n, D]`` by the past of the cell, nobody else.
+        alike: how many others look alike, and of how many, ``[n, D]`` each.
     """
 
     def __init__(self, log: Log, known: Mask, predictor: Predictor, flatness: Flatness) -> None:
@@ -102,7 +112,9 @@ class Observed:
         self.of_level = np.where(self._unwitnessed(), 0, log.likelihood(self.levels))
         self.group = log.symbols.group(log.level)
         activity = activity_of(log.level, log.flat, known)
-        self.of_flatness = flatness.of_others(self.group, activity, log.flat)
+        self.alike = self._alike()
+        usual = flatness.of_others(self.group, activity, log.flat)
+        self.of_flatness = self._shared(usual)
         self.alone = log.alone(predictor)
 
     def _unwitnessed(self) -> Mask:
@@ -119,12 +131,36 @@ class Observed:
         found: Mask = (log.level == 0) & ~touched
         return found
 
+    def _alike(self) -> tuple[Array, Array]:
+        """Return how many of the other known cells of the pad that rest as a cell does, or do not,
+        are as flat in the same piece, and how many there are, ``[n, D]`` each."""
+        log = self.log
+        alike = np.zeros(log.level.shape, np.float32)
+        every = np.zeros(log.level.shape, np.float32)
+        for rests in (True, False):
+            mine = (log.level == 0) == rests
+            tell = mine & self.known
+            for flat in range(MOVES + 1):
+                of_flat = tell & (log.flat == flat)
+                count = self.predictor.on_pad(of_flat.astype(np.float32)) - of_flat
+                every += np.where(mine, count, 0)
+                alike += np.where(mine & (log.flat == flat), count, 0)
+        return alike, every
+
+    def _shared(self, usual: Array) -> Array:
+        """Return log P(observed flatness) ``[n, D]``: the ``usual`` one, or more where so many
+        others on the pad look alike: noise is what a pad shares."""
+        alike, every = self.alike
+        posterior = np.log((alike + _USUALLY * np.exp(usual)) / (every + _USUALLY))
+        found: Array = np.maximum(usual, posterior)
+        return found
+
     def constancy(self, *, dithers: bool) -> Array:
         """Return the log ratio ``[n, D]`` of how flat a piece is, given the one before, where a
         cell holds its value: nothing where no known cell moves."""
         log = self.log
         moves = ((log.flat == MOVES) & self.known).any(axis=1)
-        healthy = self.flatness.of_chain(self.group, log.before, log.flat)
+        healthy = self._shared(self.flatness.of_chain(self.group, log.before, log.flat))
         ratio = _LOOKS[int(dithers)][log.flat] - healthy
         tells = log.holds & (log.flat != MOVES) & moves[:, None]
         found: Array = np.where(tells, ratio, 0).astype(np.float32)

@@ -1,24 +1,31 @@
-"""How cells rest, and what a pad shares: the offset by which all its cells read more or less.
+"""How cells rest, and what a pad shares: offset, drift, noise and the step of its converter.
 
-For pad p and piece t, with r the rest of each cell::
+For pad p and piece t, with r the rest of each cell and d what it drifted by since the reference::
 
-    c_p(t) = w m,   m = middle of the shortest interval that holds half of (reading - r) over the
-                        cells of the pad (shorth, Andrews et al. 1972),
+    c_p(t) = w m,   m = middle of the shortest interval that holds half of (reading - r - d) over
+                        the cells of the pad (shorth, Andrews et al. 1972),
     w = 1 where it is narrow, 0 where it is twice as wide
 
-Cell i shows a share a_i of it, learned from the reference. It is subtracted where the interval is
-narrow: no contact is so even. All cells of the pad tell,
-constant ones as well: those that are trusted would be others once the offset is wrong.
+Cell i shows a share a_i of it, learned from the reference and from the log. It is subtracted where
+the interval is narrow: no contact is so even. In a contact with most of the pad the lowest quarter
+tells: no load is negative. All cells of the pad tell, constant ones as well: those that are trusted
+would be others once the offset is wrong.
 
-Not detected: an offset of a pad with few cells; one that comes with a contact of more than half of
-them.
+A drift of single cells is a fault. Where most cells of a pad have drifted, each by its own amount,
+it is none: d is what the lowest readings of most recordings around agree on. What is noisier, or
+read in larger steps, than the reference rests within a wider range.
+
+Not detected: an offset of a pad with few cells; one that comes with a contact of all of them; a
+drift in fewer than seven recordings; an object that lies on most of a pad throughout them.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+from scipy.ndimage import median_filter
 
 from diagnostics.model.record import Array, Cells, Mask, Record
 
@@ -31,7 +38,15 @@ _RESTS = 0.25  # share of the recordings in which a cell rests at some time, at 
 _WIDER = 8.0  # than their interval is the spread of all, where these rest and others do not
 _ROUNDS = 3
 _SURE = 20.0  # pieces that a share of 1 is worth
-_MOST = 1.0  # share of the offset of a pad that a cell shows
+_MOST = 2.0  # share of the offset of a pad that a cell shows in a log; in the reference 1
+_BLOCK = 64  # pieces of a recording that are looked at as one
+_AROUND = 7  # blocks that tell where a cell rests, at least
+_MEDIAN = 5  # of them, those that tell where its pad does
+_QUIET = 0.3  # quantile of the changes between two pieces: a cell that no load moves
+_OF_DEVIATION = 0.545  # this quantile of a normal deviate's changes
+_USUALLY = 0.95  # of the pieces
+_NOISIER = 2.0  # times as noisy, or coarse, as the reference
+_WITHIN = 4.0  # standard deviations
 _UNSTEADY = 0.05  # of full scale: the rest of a cell differs between recordings by less
 
 
@@ -46,6 +61,10 @@ class Rest:
         high: ``[D]``, highest reading of each cell in the reference.
         pad: int ``[D]``, pad of each cell.
         share: ``[D]``, of what its pad shares that each cell shows.
+        noise: ``[D]``, how far each cell reads from rest in the reference by noise.
+        offsets: ``[D]``, offset of its pad that few pieces of the reference exceed.
+        drifts: ``[D]``, by how much it rests higher or lower in parts of the reference.
+        step: of the converter.
     """
 
     level: Array
@@ -54,17 +73,30 @@ class Rest:
     high: Array
     pad: Cells
     share: Array
+    noise: Array
+    offsets: Array
+    drifts: Array
+    step: float = 0.0
 
     def offset(self, record: Record, telling: Mask) -> Array:
-        """Return what each cell shares with its pad in each piece, ``[n, D]``; ``telling``: bool
-        ``[D]``, cells that are received and live."""
-        found: Array = self.share * self.of_pads(record, telling)
+        """Return by how much each cell reads more than at rest without a load, ``[n, D]``;
+        ``telling``: bool ``[D]``, cells that are received and live."""
+        drift = self.drift(record, telling)
+        of_pads = self.of_pads(record, telling, drift)
+        share = _share(record.mean - self.level - drift, of_pads, self.near, self.share)
+        # what the reference shows tells more, unless it never saw as much
+        unseen = _usually(of_pads) > _NOISIER * self.offsets
+        share = np.where(unseen, share, self.share).astype(np.float32)
+        found: Array = drift + share * of_pads
         return found
 
-    def of_pads(self, record: Record, telling: Mask) -> Array:
-        """Return the offset of each cell's pad in each piece, ``[n, D]``."""
+    def of_pads(self, record: Record, telling: Mask, drift: Array | float = 0.0) -> Array:
+        """Return the offset of each cell's pad in each piece, ``[n, D]``, beside the ``drift`` of
+        each cell."""
         found = np.zeros(record.mean.shape, np.float32)
-        stuck = self._stuck(record)
+        above = record.mean - self.level - drift
+        stuck = self._stuck(record, above)
+        at_top = record.mean >= self.full * (1 - DITHER)
         for pad in np.unique(self.pad).tolist():
             cells = self.pad == pad
             tell = np.flatnonzero(cells & telling & (self.share > _EVEN))
@@ -73,20 +105,55 @@ class Rest:
                 tell = live
             if len(tell) < _FEWEST:
                 continue
-            middle, width = shortest(record.mean[:, tell] - self.level[tell], 0.5)
+            of_pad = np.sort(np.where(at_top[:, tell], np.nan, above[:, tell]), axis=1)
             noise = float(np.median(self.near[tell]))
-            below = np.maximum(noise, _EVEN * -middle)
-            limit = np.where(middle < 0, below, _NOISES * noise)
-            # twice as wide, nothing is shared; between, a part: a jump would look like a load
-            shared = middle * np.clip(2 - width / limit, 0, 1)
-            found[:, cells] = np.nan_to_num(shared)[:, None]
+            shared = _even(of_pad, 0.5, noise, _NOISES * noise)
+            # in a contact with most of the pad, those that rest are the lowest
+            lowest = of_pad[:, : len(tell) // 2 + 1]
+            if lowest.shape[1] > _FEWEST:
+                shared = np.where(shared == 0, _even(lowest, 0.5, noise, noise / 2), shared)
+            found[:, cells] = shared[:, None]
         return found
 
-    def _stuck(self, record: Record) -> Mask:
+    def drift(self, record: Record, telling: Mask) -> Array:
+        """Return by how much each cell rests higher than it did in the reference, where most of its
+        pad do, each by an amount of its own, ``[n, D]``.
+
+        That is what the lowest readings of most of the recordings around agree on: a contact
+        differs from recording to recording.
+        """
+        found = np.zeros(record.mean.shape, np.float32)
+        first = _blocks(record)
+        if len(first) < _AROUND:
+            return found
+        lowest = np.fmin.reduceat(record.mean - self.level, first, axis=0)
+        of_block = np.zeros_like(lowest)
+        for pad in np.unique(self.pad).tolist():
+            cells = np.flatnonzero((self.pad == pad) & np.isfinite(lowest).all(axis=0))
+            tell = telling[cells]
+            if tell.sum() < _FEWEST:
+                continue
+            low = lowest[:, cells]
+            near = self.near[cells]
+            middle = median_filter(np.median(low[:, tell], axis=1), _MEDIAN, mode="nearest")
+            shared = middle[:, None]
+            own, agree = _usual(low - shared, _NOISES * near)
+            apart = np.median(np.abs(own[:, tell]), axis=1, keepdims=True)
+            usual = np.abs(own) <= _NOISES * (apart + near)
+            agree &= usual | (np.abs(shared + own) <= near)  # as the others, or not at all
+            rests = shared + np.where(agree, own, 0)
+            beyond = np.abs(rests) > np.maximum(near, _NOISIER * self.drifts[cells])
+            displaced = (agree & beyond)[:, tell].mean(axis=1) > _EVEN
+            of_block[np.ix_(displaced, cells)] = rests[displaced]
+        pieces = np.diff(np.append(first, len(record)))
+        found[:] = np.repeat(of_block, pieces, axis=0)
+        return found
+
+    def _stuck(self, record: Record, above: Array) -> Mask:
         """Return the cells that hold one value away from rest throughout, bool ``[D]``: where most
         of their pad do not, they share nothing with it."""
         ranges = np.fmax.reduce(record.high) - np.fmin.reduce(record.low)
-        away = np.abs(record.mean[0] - self.level) > self.near
+        away = np.abs(above[0]) > self.near
         found: Mask = away & (ranges <= DITHER * self.full)
         return found
 
@@ -99,6 +166,47 @@ class Rest:
         found: Array = np.where(above < 0, np.minimum(above + uneven, 0), above)
         return found
 
+    def unsure(self, record: Record, above: Array, telling: Mask) -> tuple[Array, float]:
+        """Return how far above or below rest a cell reads without a load in this log, ``[D]``, and
+        the step of its converter: ``near``, or more where the pad is noisier than in the reference,
+        or the converter coarser. ``above``: readings above rest ``[n, D]``."""
+        step = _step(record, telling, DITHER * self.full, 1e-5 * self.full)
+        noise = self.noise_of(record, above, telling)
+        found = np.where(noise > _NOISIER * self.noise, np.maximum(self.near, noise), self.near)
+        if step <= max(2 * float(np.median(self.near)), _NOISIER * self.step):
+            step = 0.0
+        return np.maximum(found, step).astype(np.float32), step
+
+    def noise_of(self, record: Record, above: Array, telling: Mask) -> Array:
+        """Return how far a cell reads from rest by noise, or as it drifts, ``[D]``; ``above``:
+        readings above rest ``[n, D]``."""
+        drift = self.drift(record, telling)[_blocks(record)]
+        later = _AROUND // 2
+        found: Array = np.abs(drift[later:] - drift[:-later]).max(axis=0, initial=0)
+        follows = ~record.first[1:]
+        if follows.sum() < _FEWEST:
+            return found
+        change = np.abs(np.diff(above, axis=0))[follows]
+        usual = np.nan_to_num(np.quantile(change, _QUIET, axis=0)) / _OF_DEVIATION
+        for pad in np.unique(self.pad).tolist():
+            cells = (self.pad == pad) & telling
+            if cells.sum() >= _FEWEST:
+                found[cells] = np.maximum(found[cells], _WITHIN * np.median(usual[cells]))
+        return found
+
+
+def _step(record: Record, telling: Mask, moves: float, same: float) -> float:
+    """Return the smallest difference between two readings of a usual cell that moves; 0 without
+    any."""
+    ranges = np.fmax.reduce(record.high) - np.fmin.reduce(record.low)
+    moving = telling & (ranges > moves)
+    if moving.sum() < _FEWEST:
+        return 0.0
+    read = np.sort(np.concatenate([record.low[:, moving], record.high[:, moving]]), axis=0)
+    steps = np.diff(read, axis=0)
+    smallest = np.where(steps > same, steps, np.inf).min(axis=0)
+    return float(np.median(smallest))
+
 
 def fit_rest(record: Record, full: float, step: float, pad: Cells, living: Mask) -> Rest:
     """Return how cells of the reference rest; ``step``: of their converter; ``living``: bool
@@ -109,31 +217,50 @@ def fit_rest(record: Record, full: float, step: float, pad: Cells, living: Mask)
     near = np.full_like(level, least)
     high = np.fmax.reduce(record.high)
     share = np.ones_like(level)
-    rest = Rest(level, near, full, high, pad, share)
+    none = np.zeros_like(level)
+    most = np.full_like(level, np.inf)
+    rest = Rest(level, near, full, high, pad, share, none, most, most, step)
     for _ in range(_ROUNDS):
-        share = _share(record, rest, living, least)
-        without = record.mean - share * rest.of_pads(record, living)
+        of_pads = rest.of_pads(record, living)
+        usual = np.ones_like(share)
+        share = _share(record.mean - rest.level, of_pads, rest.near, usual, least)
+        share = np.minimum(share, usual)
+        without = record.mean - share * of_pads
         level, spread = _lowest(without, first, least)
         range_ = record.high - record.low
         resting = np.where(without <= level + 2 * spread, range_, np.nan)
         noise = np.nan_to_num(np.nanmedian(resting, axis=0))
         unsteady = np.minimum(spread, _UNSTEADY * full)
         near = np.fmax(least, 2 * np.fmax(noise, unsteady)).astype(np.float32)
-        rest = Rest(level, near, full, high, pad, share)
-    return rest
+        rest = Rest(level, near, full, high, pad, share, none, most, most, step)
+    noise = rest.noise_of(record, rest.above(record, living), living)
+    offsets = np.maximum(near, _usually(rest.of_pads(record, living)))
+    drifts = _usually(replace(rest, drifts=none).drift(record, living))
+    return replace(rest, noise=noise, offsets=offsets, drifts=drifts)
 
 
-def _share(record: Record, rest: Rest, living: Mask, least: float) -> Array:
+def _usually(values: Array) -> Array:
+    found: Array = np.quantile(np.abs(values), _USUALLY, axis=0).astype(np.float32)
+    return found
+
+
+def _share(above: Array, of_pads: Array, near: Array, prior: Array, least: float = 0.0) -> Array:
     """Return the share of the offset of its pad that each cell shows, ``[D]``: least squares over
-    the pieces in which it is not loaded, shrunk to 1; ``least``: a smaller offset tells nothing."""
-    offset = rest.of_pads(record, living)
-    above = record.mean - rest.level
-    resting = np.abs(above) <= rest.near + 2 * np.abs(offset)
-    tells = resting & (np.abs(offset) > least)
-    x = np.where(tells, offset, 0).astype(np.float64)
+    the pieces in which it is not loaded, shrunk to a ``prior`` ``[D]``.
+
+    Args:
+        above: readings above rest ``[n, D]``.
+        of_pads: offset of each cell's pad, ``[n, D]``.
+        near: ``[D]``, as of :class:`Rest`.
+        prior: share that is expected.
+        least: a smaller offset tells nothing.
+    """
+    resting = np.abs(above) <= near + 2 * np.abs(of_pads)
+    tells = resting & (np.abs(of_pads) > least)
+    x = np.where(tells, of_pads, 0).astype(np.float64)
     y = np.where(tells, above, 0)
-    prior = _SURE * rest.near.astype(np.float64) ** 2
-    slope = ((x * y).sum(axis=0) + prior) / ((x * x).sum(axis=0) + prior)
+    sure = _SURE * near.astype(np.float64) ** 2
+    slope = ((x * y).sum(axis=0) + sure * prior) / ((x * x).sum(axis=0) + sure)
     found: Array = np.clip(slope, 0, _MOST).astype(np.float32)
     return found
 
@@ -151,6 +278,35 @@ def _lowest(readings: Array, first: Cells, least: float) -> tuple[Array, Array]:
     agree = _WIDER * np.maximum(width, least) < spread
     level = np.where(agree, middle, usual).astype(np.float32)
     return level, np.where(agree, _WIDER * width, spread).astype(np.float32)
+
+
+def _even(above: Array, share: float, noise: float, most: float) -> Array:
+    """Return by how much a share of the cells of a pad, at least, reads too much alike, ``[n]``;
+    ``above``: ``[n, k]`` in ascending order; ``most``: by which they differ at most."""
+    middle, width = shortest(above, share)
+    below = np.maximum(noise, _EVEN * -middle)
+    limit = np.where(middle < 0, below, most)
+    # twice as wide, nothing is shared; between, a part: a jump would look like a load
+    found: Array = np.nan_to_num(middle * np.clip(2 - width / limit, 0, 1))
+    return found
+
+
+def _blocks(record: Record) -> Cells:
+    """Return the first pieces of recordings, and of the parts of long ones, int ``[blocks]``."""
+    first = np.flatnonzero(record.first)
+    pieces = np.diff(np.append(first, len(record)))
+    within = np.arange(len(record)) - np.repeat(first, pieces)
+    return np.flatnonzero(within % _BLOCK == 0)
+
+
+def _usual(values: Array, limit: Array) -> tuple[Array, Mask]:
+    """Return what most of the blocks around each one agree on, ``[blocks, k]``, and whether they
+    do: they differ by less than the ``limit`` ``[k]``."""
+    half = _AROUND // 2
+    mirrored = np.pad(values, ((half, half), (0, 0)), mode="reflect")
+    around = sliding_window_view(mirrored, 2 * half + 1, axis=0)
+    middle, width = shortest(around.reshape(-1, 2 * half + 1), 0.5)
+    return middle.reshape(values.shape), width.reshape(values.shape) <= limit
 
 
 def shortest(values: Array, share: float) -> tuple[Array, Array]:

@@ -32,12 +32,10 @@ class Symbols:
     Attributes:
         edges: root loads between the levels.
         rest: how cells rest.
-        width: of each level, probability that two readings in it agree.
     """
 
     edges: Array
     rest: Rest
-    width: Array
 
     @classmethod
     def fit(cls, above: Array, rest: Rest, living: Mask) -> Symbols:
@@ -48,10 +46,16 @@ class Symbols:
         if len(loads):
             quantiles = np.quantile(loads, np.linspace(0, 1, _LEVELS - 1)[1:-1]).tolist()
         edges = np.unique([NOTHING, *quantiles]).astype(np.float32)
-        ranges = np.diff(np.append(edges, 1.0) ** 2)
-        agree = np.minimum(1, 2 * HOLDS * DITHER / np.maximum(ranges, 1e-9))
-        width = np.concatenate([[1.0], agree, [1.0, 1.0]]).astype(np.float32)
-        return cls(edges, rest, width)
+        return cls(edges, rest)
+
+    def agree(self, step: float) -> Array:
+        """Return of each level the probability that two readings in it agree; ``step``: of the
+        converter."""
+        ranges = np.diff(np.append(self.edges, 1.0) ** 2)
+        same = max(2 * HOLDS * DITHER, step / self.rest.full)
+        agree = np.minimum(1, same / np.maximum(ranges, 1e-9))
+        found: Array = np.concatenate([[1.0], agree, [1.0, 1.0]]).astype(np.float32)
+        return found
 
     @property
     def n(self) -> int:

@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 
 from diagnostics import SensorLayout
 from diagnostics.model.record import record_of
-from diagnostics.model.rest import fit_rest, shortest
+from diagnostics.model.rest import Rest, fit_rest, shortest
 from diagnostics.preprocessing.tolerance import converter_step
 
 PAD = np.repeat([0, 1], 12)
@@ -68,16 +68,17 @@ def test_a_cell_that_shares_more_of_a_sag_than_others_reads_nothing_below_rest()
     assert (above[:, 12:] >= -rest.near[12:]).all()
 
 
-def test_cells_that_are_stuck_tell_nothing_of_the_offset_of_their_pad():
+def test_cells_that_are_stuck_tell_nothing_of_where_the_others_of_their_pad_rest():
     living = np.ones(24, bool)
     rest = fit_rest(record_of(touched(0), 8), 1000.0, 1.0, PAD, living)
     log = touched(1)
-    stuck = np.linspace(200, 900, 5)
+    drift = np.linspace(-52, -28, 12)
     for frames in log:
-        frames[:, 12:] += np.linspace(-52, -28, 12)
-        frames[:, 19:] = stuck
+        frames[:, 12:] += drift
+        frames[:, 19:] = np.linspace(200, 900, 5)
     offset = rest.offset(record_of(log, 8), living)
-    np.testing.assert_allclose(offset[:, 12:], -43, atol=6)
+    np.testing.assert_allclose(offset[:, 12:19], np.broadcast_to(drift[:7], (72, 7)), atol=6)
+    np.testing.assert_allclose(offset[:, 19:], -40, atol=12)
 
 
 @given(st.sets(st.integers(12, 23), max_size=4))
@@ -102,3 +103,52 @@ def test_a_cell_that_does_not_drift_with_its_pad_is_learned_as_such(steady):
 def test_the_step_of_the_converter_is_the_smallest_usual_difference():
     readings = [(np.arange(200) % 13 * 4.0)[:, None]]
     assert converter_step(readings, SensorLayout(1, 1, 1, full_scale=100.0)) == 4.0
+
+
+def rest_of_reference(living: np.ndarray) -> Rest:
+    return fit_rest(record_of(touched(0), 8), 1000.0, 1.0, PAD, living)
+
+
+@given(st.integers(0, 99), st.floats(0, 90))
+def test_cells_that_drift_each_by_its_own_amount_rest_where_they_did(seed, most):
+    rng = np.random.default_rng(seed)
+    living = np.ones(24, bool)
+    rest = rest_of_reference(living)
+    drift = np.concatenate([rng.permutation(np.linspace(0, most, 12)) for _ in range(2)])
+    log = [frames + drift for frames in touched(1)]
+    above = rest.above(record_of(log, 8), living)
+    resting = np.abs(above) < 150
+    assert resting.mean() > 0.8
+    assert (above[resting] <= 3 * rest.near.max()).all()
+
+
+@given(st.floats(10, 90))
+def test_a_contact_with_most_of_a_pad_hides_no_offset_of_it(size):
+    living = np.ones(24, bool)
+    rest = rest_of_reference(living)
+    rng = np.random.default_rng(1)
+    log = [100 + rng.normal(0, 1, (48, 24)) for _ in range(12)]
+    for i, frames in enumerate(log):
+        frames[12:36, :7] += np.linspace(200, 500, 7)
+        frames += size * np.sin(np.arange(48) // 8 + i)[:, None]
+    record = record_of(log, 8)
+    shared = size * np.sin(np.arange(6) + np.arange(12)[:, None]).ravel()
+    away = np.abs(rest.of_pads(record, living) - shared[:, None])
+    assert (away <= rest.near.max()).all()
+
+
+@given(st.sampled_from([25.0, 50.0, 100.0]))
+def test_a_coarser_converter_and_a_noisier_pad_widen_what_counts_as_rest(step):
+    rng = np.random.default_rng(0)
+    living = np.ones(24, bool)
+    rest = rest_of_reference(living)
+    log = touched(1)
+    record = record_of(log, 8)
+    assert (rest.unsure(record, rest.above(record, living), living)[0] == rest.near).all()
+    coarse = record_of([np.floor(frames / step) * step for frames in log], 8)
+    unsure, found = rest.unsure(coarse, rest.above(coarse, living), living)
+    assert found == step
+    assert (unsure >= step).all()
+    noisy = record_of([frames + rng.normal(0, step, frames.shape) for frames in log], 8)
+    unsure, _ = rest.unsure(noisy, rest.above(noisy, living), living)
+    assert (unsure > step / 2).all()

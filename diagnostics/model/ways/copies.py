@@ -30,8 +30,7 @@ def _of(observed: Observed, units: Units, source: Array, given: Array) -> Array:
     rest = log.symbols.rest
     away = np.abs(log.record.mean - source)
     loaded = (log.level > 0) | (source - rest.level > rest.near)
-    agree = np.log(log.symbols.width)[log.level]
-    same = np.log(1 - MISS) - agree - observed.of_level
+    same = np.log(1 - MISS) - log.agree - observed.of_level
     ratio = np.where(away <= log.symbols.tolerance, same, np.log(MISS))
     told = loaded & log.record.received & np.isfinite(source)
     evidence = throughout(np.where(told, ratio, 0), units)

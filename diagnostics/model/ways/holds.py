@@ -26,8 +26,7 @@ _EXPECTED = np.log([0.2, 0.4])  # P(value): anywhere in between; at rest or at t
 def _ratio(observed: Observed, *, dithers: bool) -> Array:
     log = observed.log
     matches = log.holds & (log.flat != MOVES)
-    agree = np.log(log.symbols.width)[log.level]
-    holds = np.log(1 - MISS) - agree - observed.of_level
+    holds = np.log(1 - MISS) - log.agree - observed.of_level
     ratio = np.where(matches, holds, np.log(MISS))
     found: Array = ratio + _CONSTANT * observed.constancy(dithers=dithers)
     return found * log.record.received

@@ -235,7 +235,7 @@ def _array(path: Path, column: Any, about: _Column, first: int) -> NDArray[Any]:
                 came = "no list" if lengths[wrong[0]] < 0 else f"a list of {lengths[wrong[0]]}"
                 what = f"{about.name} holds {came} where the first row has {expected}"
                 raise InputError.at(path, f"{what}; give all rows the same", f"row {row}")
-            column = column.flatten()
+            column = _flat(path, column)
             sizes = sizes[1:]
         elif pa.types.is_dictionary(kind):
             column = column.dictionary_decode()
@@ -249,11 +249,26 @@ def _array(path: Path, column: Any, about: _Column, first: int) -> NDArray[Any]:
     return values.reshape(rows, *about.shape[1:])
 
 
+def _has_offsets(path: Path, column: Any) -> bool:
+    """Return whether rows are lists that lie one behind the other, none missing."""
+    types = imported("pyarrow.types", path)
+    return (
+        types.is_list(column.type) or types.is_large_list(column.type)
+    ) and not column.null_count
+
+
+def _flat(path: Path, column: Any) -> Any:
+    """Return the values of the lists in a column, one behind the other."""
+    if not _has_offsets(path, column):
+        return column.flatten()
+    begin = column.offsets[0].as_py()  # flatten imports pyarrow.compute, which is slow
+    return column.values.slice(begin, column.offsets[-1].as_py() - begin)
+
+
 def _lengths(path: Path, column: Any) -> NDArray[Any]:
     """Return how many values each row of a column of lists has; -1: no list."""
     pa = imported("pyarrow", path)
-    has_offsets = pa.types.is_list(column.type) or pa.types.is_large_list(column.type)
-    if has_offsets and not column.null_count:
+    if _has_offsets(path, column):
         return np.diff(_numpy(pa, column.offsets))
     compute = imported("pyarrow.compute", path)  # slow to import, and rarely needed
     counts = compute.list_value_length(column)

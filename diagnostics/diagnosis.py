@@ -901,8 +901,6 @@ class SelfDiagnosis:
             return judged(RecordingBlocks([log.given[i] for i in some]))
 
         whole = judged(log)
-        if len(log) < 2:
-            return whole
         lengths = [len(given) for given in log.given]
         # without a reference, a part of a log tells less than the whole
         part = None if self.reference_ is None else of_part

@@ -115,8 +115,7 @@ def quick(statistics: Statistics) -> Quick:
         n_recordings=len(lengths),
         transport=_transport(statistics),
     )
-    if len(lengths) > 1:
-        diagnosis = with_recordings(diagnosis, held, lengths, tolerance, None)
+    diagnosis = with_recordings(diagnosis, held, lengths, tolerance, None)
     together = statistics.together.of_cells(order)
     present = layout.present.ravel()
     answers = together.answers(spans)[place] & present

@@ -49,7 +49,8 @@ def with_recordings(
     tolerance: float,
     diagnose: Callable[[Recordings], Diagnosis] | None,
 ) -> Diagnosis:
-    """Return the diagnosis of a log with what shows in some of its recordings only.
+    """Return the diagnosis of a log with what shows in some of its recordings only; of one
+    recording, the diagnosis.
 
     Args:
         whole: the diagnosis of the log.
@@ -58,6 +59,8 @@ def with_recordings(
         tolerance: readings within +- this of a value count as that value.
         diagnose: diagnoses some recordings as a log of their own; None: they are not at hand.
     """
+    if len(lengths) < 2:
+        return whole
     # What an object holds, or its edge, is no held value of a cell.
     held = replace(held, suspect=held.suspect & ~whole.disturbed.mask)
     first = np.concatenate([[0], np.cumsum(lengths)]).tolist()

@@ -25,6 +25,7 @@ from diagnostics import SensorLayout
 LAYOUT = SensorLayout(1, 2, 2, full_scale=1.0)
 NO_PATHS = {
     *("key", "topic", "field", "columns", "ignore", "time_column", "label_column", "unit", "shape"),
+    "shard",
     *(
         "device",
         "fail_on",

@@ -29,7 +29,7 @@ from diagnostics.model.predictor import Predictor
 from diagnostics.model.record import Array, Cells, Mask, Record, Recorder, record_of
 from diagnostics.model.rest import DITHER
 from diagnostics.model.symbols import NOTHING, Flatness, Symbols
-from diagnostics.model.ways import WAYS, Way
+from diagnostics.model.ways import COMES_AND_GOES, FLOATS, WAYS, Way
 
 _SUSPECT = 3.0  # evidence of a fault with which a cell predicts no other
 _WORST = 0.5  # of the highest evidence: who leaves in one round
@@ -185,7 +185,9 @@ class Model:
             log.far &= ~explained
         of_groups = self.groups.failing(log, log.far & self.living)
         observed = self._by_trusted(log, of_groups.cells)
-        failing = self.lines.failing(observed, self.moving(log), of_groups)
+        moving = self.moving(log)
+        telling = moving & ~self._by_itself(observed, moving)
+        failing = self.lines.failing(observed, moving, telling, of_groups)
         if (failing.cells & ~of_groups.cells).any():
             observed = self._by_trusted(log, failing.cells)
         units = replace(Units.of(observed, self.odd), goes=_GOES)
@@ -206,6 +208,18 @@ class Model:
             failing=failing,
             disturbed=self._disturbed(observed, probability, log.far & ~failing.cells),
         )
+
+    def _by_itself(self, observed: Observed, moving: Mask) -> Mask:
+        """Return the ``moving`` cells that move by themselves and do not just come and go, bool
+        ``[D]``: they tell nothing of their line, where they are not most of it."""
+        units = Units.of(observed, self.odd)
+        floats = FLOATS.evidence(observed, units)
+        goes = COMES_AND_GOES.evidence(observed, units)
+        alone = moving & ~observed.known & (floats > _SUSPECT) & (floats > goes)
+        on = self.lines.on & moving
+        most = 2 * (on & alone).sum(axis=1) > on.sum(axis=1)
+        found: Mask = alone & ~on[most].any(axis=0)
+        return found
 
     def moving(self, log: Log) -> Mask:
         """Return the cells that move and hold no load at the end, bool ``[D]``."""

@@ -243,18 +243,24 @@ class Lines:
         of_piece = np.searchsorted(begins, np.arange(len(record)), "right") - 1
         return Units(begins, of_piece, odd, units.opens[opens])
 
-    def failing(self, observed: Observed, eligible: Mask, failing: Failing) -> Failing:
-        """Return the lines that fail in a log besides groups that are ``failing``; ``eligible``:
-        bool ``[D]``, cells that move and hold no load."""
+    def failing(self, observed: Observed, moving: Mask, telling: Mask, failing: Failing) -> Failing:
+        """Return the lines that fail in a log besides groups that are ``failing``.
+
+        Args:
+            observed: the log.
+            moving: bool ``[D]``, cells that move and hold no load.
+            telling: bool ``[D]``, those of them that tell of their line.
+            failing: the groups.
+        """
         of_groups = failing
         record = observed.log.record
         found = 0
         while len(self.on):
             free = ~failing.cells
             known = observed.known & free
-            evidence, of_blocks, ratio, blocks = self.evidence(observed, known, eligible & free)
+            evidence, of_blocks, ratio, blocks = self.evidence(observed, known, telling & free)
             evidence = within_limit(evidence, self.highest, len(record.units) / self.reached)
-            on = self.on & eligible & free
+            on = self.on & moving & free
             of_cell = np.where(on, evidence[:, None], 0).max(axis=0)
             failing = replace(failing, evidence=np.maximum(failing.evidence, of_cell))
             worst = int(evidence.argmax())

@@ -12,4 +12,4 @@ from diagnostics.model.ways.way import Way
 
 WAYS = (HOLDS, DITHERS, FLOATS, COMES_AND_GOES, LATE, LATER, CLAMPED, COPIES)
 
-__all__ = ["WAYS", "Way"]
+__all__ = ["COMES_AND_GOES", "FLOATS", "WAYS", "Way"]

@@ -228,10 +228,15 @@ class Model:
 
     def evidence_of_any(self, observed: Observed, units: Units) -> Array:
         """Return the evidence ``[D]`` of any of the ways that tell who is trusted."""
+        return self._told(observed, units)[0]
+
+    def _told(self, observed: Observed, units: Units) -> tuple[Array, Array]:
+        """Return the evidence ``[D]`` of any of the ways that tell who is trusted, within the
+        limits of healthy cells and without: these say who is suspect, not who is worse."""
         deciding = [i for i, way in enumerate(WAYS) if way.decides]
         ways = [WAYS[i] for i in deciding]
         each = np.stack([way.evidence(observed, units) for way in ways])
-        return _of_any(self._certain(each, units, deciding), ways)
+        return _of_any(self._certain(each, units, deciding), ways), _of_any(each, ways)
 
     def _by_trusted(self, log: Log, out: Mask) -> Observed:
         """Return what those say of a log who are trusted to predict the others; those that are
@@ -241,13 +246,13 @@ class Model:
         observed = self.observed(log, self.moving(log) & ~out)
         for _ in range(_ROUNDS):
             known = observed.known
-            evidence = self.evidence_of_any(observed, Units.of(observed, self.odd))
+            evidence, of_all = self._told(observed, Units.of(observed, self.odd))
             suspect = known & (evidence > _SUSPECT)
             if suspect.any():
-                observed = self.observed(log, known & ~self._worst(suspect, known, evidence))
+                observed = self.observed(log, known & ~self._worst(suspect, known, of_all))
                 continue
             # a cell that a worse one of its pad had made look wrong comes back, but once only
-            misled = ~holds & ~self._worst_of_pad(~known, evidence)
+            misled = ~holds & ~self._worst_of_pad(~known, of_all)
             joins = ~known & ~stays & ((evidence < 0) | misled)
             if not joins.any():
                 break

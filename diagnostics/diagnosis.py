@@ -305,8 +305,8 @@ class SelfDiagnosis:
         self.reference_ = replace(self.reference_, sizes=usual, floors=floors)
         if self.engine == "model":
             self._model = fit_model(list(healthy), layout, dead > 0, progress=progress)
-            if self._model is not None:
-                calibrator = Calibrator.cold()
+        if self._model is not None:
+            calibrator = Calibrator.cold()
         elif self.proof_of_life:
             self.reference_ = self.reference_.with_life(healthy, layout)
         if calibrator is None:
@@ -542,7 +542,8 @@ class SelfDiagnosis:
                 fitted.load.check(fitted.layout)
             if fitted.reference is not None:
                 fitted.reference.check(diagnoser._planes)
-                diagnoser.proof_of_life = fitted.reference.life is not None
+                proves = fitted.reference.life is not None or fitted.model is not None
+                diagnoser.proof_of_life = proves
         except KeyError as error:
             raise ValueError(f"the stored diagnosis is damaged: {error} is missing") from None
         except (TypeError, ValueError, AttributeError) as error:

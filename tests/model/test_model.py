@@ -179,6 +179,17 @@ def test_a_reference_that_shows_too_little_gives_no_model(reference):
     assert fit_model(reference, LAYOUT, np.zeros(64, bool)) is None
 
 
+def test_without_a_model_a_log_is_judged_as_the_default_judges_it(healthy):
+    reference = [frames[20:42] for frames in presses(0, 7)]
+    for frames in healthy:
+        frames[:, USED] = 1500.0
+    default = SelfDiagnosis(LAYOUT, engine="events").fit(reference)
+    fitted = SelfDiagnosis(LAYOUT, engine="model").fit(reference)
+    assert fitted._model is None
+    assert (fitted.reference_.life is None) == (default.reference_.life is None)
+    assert fitted.diagnose(healthy).to_dict() == default.diagnose(healthy).to_dict()
+
+
 def test_one_long_recording_is_a_reference_as_well(healthy):
     fitted = SelfDiagnosis(LAYOUT, engine="model").fit(np.concatenate(presses(0, 80)))
     assert not blamed(fitted, healthy)
@@ -198,6 +209,7 @@ def test_a_stored_diagnosis_judges_bit_for_bit_as_before(fitted, tmp_path, healt
     fitted.save(path)
     again = SelfDiagnosis.load(path)
     assert again.engine == "model"
+    assert again.get_params()["proof_of_life"] is True
     assert again.diagnose(healthy).to_dict() == fitted.diagnose(healthy).to_dict()
 
 

@@ -30,10 +30,9 @@ from diagnostics.model.lines import (
     Failing,
     cells_on,
     odd_of,
-    within_limit,
 )
 from diagnostics.model.observed import Log
-from diagnostics.model.over_time import Units, coming_and_going, for_good
+from diagnostics.model.over_time import Units, coming_and_going, for_good, within_limit
 from diagnostics.model.record import Array, Cells, Mask, Record
 from diagnostics.model.symbols import NOTHING, Symbols
 from diagnostics.wiring import LineKind

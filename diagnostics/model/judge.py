@@ -24,7 +24,7 @@ from diagnostics.model.as_one import AsOne
 from diagnostics.model.groups import Groups
 from diagnostics.model.lines import Failing, Lines
 from diagnostics.model.observed import Log, Observed
-from diagnostics.model.over_time import USUAL, Units
+from diagnostics.model.over_time import USUAL, Units, within_limit
 from diagnostics.model.predictor import Predictor
 from diagnostics.model.record import Array, Cells, Mask, Record, Recorder, record_of
 from diagnostics.model.rest import DITHER
@@ -34,8 +34,6 @@ from diagnostics.model.ways import COMES_AND_GOES, FLOATS, WAYS, Way
 _SUSPECT = 3.0  # evidence of a fault with which a cell predicts no other
 _WORST = 0.5  # of the highest evidence: who leaves in one round
 _ROUNDS = 16
-_CERTAIN = 6.0  # evidence that a healthy cell does not reach
-_SAFETY = 1.5
 _GOES = 8.0  # evidence that a fault has gone
 HELD = 3  # pieces at the end at one load: it may be stuck
 _PREVALENCE = 0.03
@@ -159,10 +157,8 @@ class Model:
         short, long = self.reached.tolist()
         of_short, of_long = self.highest[:, chosen]
         share = np.clip((len(units.begins) - short) / max(1, long - short), 0, 1)
-        longer = max(1.0, len(units.begins) / long)
-        most = _SAFETY * longer * (of_short + share * (of_long - of_short))
-        found: Array = evidence * np.where(evidence > 0, _CERTAIN / np.maximum(_CERTAIN, most), 1)
-        return found
+        highest = of_short + share * (of_long - of_short)
+        return within_limit(evidence, highest, len(units.begins) / long)
 
     def log_of_record(self, record: Record) -> Log:
         """Return a record as symbols."""
@@ -171,10 +167,6 @@ class Model:
     def observed(self, log: Log, known: Mask) -> Observed:
         """Return what the ``known`` cells say of a log."""
         return Observed(log, known, self.predictor, self.flatness)
-
-    def judge(self, recordings: Sequence[NDArray[np.floating]]) -> Judgement:
-        """Judge a log, recordings ``[T, D]``."""
-        return self.judge_record(self.record_of(recordings))
 
     def judge_record(self, record: Record, explained: Mask | None = None) -> Judgement:
         """Judge a record, with pieces of this model's length; ``explained`` cells (bool ``[D]``;

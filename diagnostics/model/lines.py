@@ -28,8 +28,8 @@ from scipy.special import expit, logsumexp
 from diagnostics.layout import SensorLayout
 from diagnostics.model.conditional_mean import ConditionalMean
 from diagnostics.model.observed import Observed
-from diagnostics.model.over_time import Units, coming_and_going, for_good
-from diagnostics.model.record import Array, Cells, Mask, Record
+from diagnostics.model.over_time import Units, coming_and_going, for_good, within_limit
+from diagnostics.model.record import Array, Cells, Mask, Record, since_begin
 from diagnostics.model.symbols import NOTHING
 from diagnostics.preprocessing.levels import CERTAIN_RATIO, DOUBTED, EXPECTED_LATE
 from diagnostics.preprocessing.levels import FEWEST as FEWEST_LOADED
@@ -50,8 +50,6 @@ _ODD_RECORDINGS = 50.0  # of all lines, which weigh on the share of one
 _SEEN = 3.0  # over the recordings: the share of what was never seen in them
 _RARELY = 1e-3
 _OFTEN = 0.2
-_CERTAIN = 6.0  # evidence that a healthy line does not reach
-_SAFETY = 1.5
 _RARE = float(np.log(EXPECTED_LATE))
 _PRIOR = _RARE - CERTAIN_RATIO / 2  # and there may be contacts unlike the reference's
 PROVEN = float(np.log(9.0) - _PRIOR)  # evidence: at odds of 9
@@ -234,10 +232,7 @@ class Lines:
         """Return the recordings of a log, in parts where they are long, as units."""
         units = Units.of(observed, self.odd)
         record = observed.log.record
-        recording = np.cumsum(units.opens)
-        first = np.flatnonzero(units.opens)
-        within = np.arange(len(recording)) - first[recording - 1]
-        opens = np.flatnonzero(within % _BLOCK == 0)
+        opens = np.flatnonzero(since_begin(units.opens) % _BLOCK == 0)
         begins = units.begins[opens]
         odd = np.maximum.reduceat(units.odd, opens, axis=0)
         of_piece = np.searchsorted(begins, np.arange(len(record)), "right") - 1
@@ -309,14 +304,6 @@ class Lines:
         low = crossing & (ratio < least) & (ratio < middle + _PULLED)
         found: Mask = self.on[low].any(axis=0)
         return found
-
-
-def within_limit(evidence: Array, highest: Array, longer: float) -> Array:
-    """Return evidence so that what a healthy line reaches stays below certainty, in a log that is
-    so many times as long as those in which it did."""
-    most = _SAFETY * max(1.0, longer) * highest
-    found: Array = evidence * (_CERTAIN / np.maximum(_CERTAIN, most))
-    return found
 
 
 def cells_on(layout: SensorLayout, living: Mask, kinds: Collection[LineKind] = _KINDS) -> Mask:

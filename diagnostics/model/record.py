@@ -61,10 +61,7 @@ class Record:
     @cached_property
     def of_unit(self) -> Cells:
         """Unit of each piece, int ``[n]``, from 0."""
-        first = np.flatnonzero(self.first)
-        pieces = np.diff(np.append(first, len(self)))
-        within = np.arange(len(self)) - np.repeat(first, pieces)
-        found: Cells = np.cumsum(within % UNIT == 0) - 1
+        found: Cells = np.cumsum(since_begin(self.first) % UNIT == 0) - 1
         return found
 
     @cached_property
@@ -234,9 +231,8 @@ class Recorder:
         else:
             open_frames = int(self.last.frames[-1])
         # frames of the recording so far, up to a multiple of the length
-        since = np.arange(len(frames)) + open_frames
-        since -= np.maximum.accumulate(np.where(begins, since, 0))
-        starts = (since % self.length == 0) | begins
+        since = since_begin(begins) + np.where(begins.cumsum() == 0, open_frames, 0)
+        starts = since % self.length == 0
         first = np.flatnonzero(starts)
         continues = not starts[0]
         if continues:
@@ -302,6 +298,14 @@ class Recorder:
         every = _Pieces.joined(complete)
         every = every.chosen(~every.unchanged(self.tolerance))
         return (every.chosen(slice(-int(self.most * _KEPT), None)),)
+
+
+def since_begin(begins: Mask) -> Cells:
+    """Return how far each step lies behind the last one that begins something, or behind the first
+    one, int ``[n]`` of bool ``[n]``."""
+    step = np.arange(len(begins))
+    found: Cells = step - np.maximum.accumulate(np.where(begins, step, 0))
+    return found
 
 
 def record_of(

@@ -27,7 +27,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from scipy.ndimage import median_filter
 
-from diagnostics.model.record import Array, Cells, Mask, Record
+from diagnostics.model.record import Array, Cells, Mask, Record, since_begin
 
 NARROW = 0.002  # of full scale: readings differ by it without a load
 DITHER = 0.01  # of full scale: a stuck value with the dither of its converter
@@ -293,10 +293,7 @@ def _even(above: Array, share: float, noise: float, most: float) -> Array:
 
 def _blocks(record: Record) -> Cells:
     """Return the first pieces of recordings, and of the parts of long ones, int ``[blocks]``."""
-    first = np.flatnonzero(record.first)
-    pieces = np.diff(np.append(first, len(record)))
-    within = np.arange(len(record)) - np.repeat(first, pieces)
-    return np.flatnonzero(within % _BLOCK == 0)
+    return np.flatnonzero(since_begin(record.first) % _BLOCK == 0)
 
 
 def _usual(values: Array, limit: Array) -> tuple[Array, Mask]:

@@ -161,7 +161,7 @@ def test_a_log_in_which_nothing_is_touched_blames_and_proves_nobody(fitted):
 
 
 def test_what_nothing_is_known_of_is_not_judged(model, healthy):
-    judgement = model.judge(healthy)
+    judgement = model.judge_record(model.record_of(healthy))
     assert judgement.evidence.shape == (len(WAYS), 64)
     assert judgement.probability.max() < 0.5
     assert judgement.disturbed == 0
@@ -169,8 +169,9 @@ def test_what_nothing_is_known_of_is_not_judged(model, healthy):
 
 def test_the_same_recordings_give_the_same_model(model, healthy):
     again = fit_model(presses(0, 80), LAYOUT, np.zeros(64, bool))
+    record = model.record_of(healthy)
     np.testing.assert_array_equal(
-        again.judge(healthy).probability, model.judge(healthy).probability
+        again.judge_record(record).probability, model.judge_record(record).probability
     )
 
 

@@ -18,8 +18,8 @@ from diagnostics.layout import SensorLayout
 from diagnostics.model.conditional_mean import ConditionalMean, CrossFitted
 from diagnostics.model.groups import as_one_of, fit_groups
 from diagnostics.model.judge import Judgement, Model
-from diagnostics.model.lines import NO_HALF, fit_lines, odd_of
-from diagnostics.model.observed import Log
+from diagnostics.model.lines import NO_HALF, Lines, fit_lines, odd_of
+from diagnostics.model.observed import Log, Observed
 from diagnostics.model.predictor import CrossFittedNetwork, Network, Predictor
 from diagnostics.model.record import Array, Cells, Mask, Record, frames_of_piece, record_of
 from diagnostics.model.rest import fit_rest
@@ -157,14 +157,16 @@ def fit_model(
     if len(as_one.on):
         record = record_of(recordings, length, as_one)
         reference = replace(reference, record=record)
-    groups, chain = fit_groups(as_one, Log(record, symbols, present, living), half)
+    log = Log(record, symbols, present, living)
+    groups, chain = fit_groups(as_one, log, half)
     held_out = _held_out(reference, symbols, examples, resting, chain)
     progress(0.5)
     flatness = reference.flatness(symbols, np.ones(len(record), bool))
     model = Model.of(symbols, flatness, predictor, length, present, living, lines, groups)
     held_out.judge(model, reference.of_piece)
-    model.odd = _odd(model, reference)
-    model.lines = replace(model.lines, odd=_odd_lines(model, reference))
+    observed = model.observed(log, living & log.received)
+    model.odd = _odd(observed, living)
+    model.lines = replace(model.lines, odd=_odd_lines(model.lines, observed))
     progress(0.6)
     _judge_logs(model, reference, held_out, rng)
     model.lines = replace(model.lines, resting=lines.resting, half=NO_HALF)
@@ -268,23 +270,19 @@ def _examples(
     return examples
 
 
-def _odd(model: Model, reference: _Reference) -> Array:
+def _odd(observed: Observed, living: Mask) -> Array:
     """Return in which share of its units each healthy cell is odd, ``[D]``."""
-    log = model.log_of_record(reference.record)
-    observed = model.observed(log, model.living & log.received)
     units = len(observed.odd)
     odd = observed.odd.sum(axis=0)
-    pooled = max(odd[model.living].sum() / max(1, units * model.living.sum()), _RARELY)
+    pooled = max(odd[living].sum() / max(1, units * living.sum()), _RARELY)
     share = (odd + _ODD_UNITS * pooled) / (units + _ODD_UNITS)
     found: Array = np.clip(share, _RARELY, _OFTEN).astype(np.float32)
     return found
 
 
-def _odd_lines(model: Model, reference: _Reference) -> Array:
+def _odd_lines(lines: Lines, observed: Observed) -> Array:
     """Return in which share of the recordings each healthy line is odd, ``[W]``."""
-    log = model.log_of_record(reference.record)
-    living = model.living & log.received
-    found = model.lines.evidence(model.observed(log, living), living, living)
+    found = lines.evidence(observed, observed.known, observed.known)
     return odd_of(found[1])
 
 

@@ -57,7 +57,9 @@ def judged_with_objects(
     these."""
     found: list[StaticLoad] = []
     judgement = model.judge_record(record)
-    log = model.log_of_record(record)
+    if not (judgement.probability > _BLAMED).any():  # an object has to explain a fault
+        return judgement, found
+    log = judgement.observed.log
     held = HeldLoads.of(log, model)
     for _ in range(_ROUNDS):
         more = find_objects(model, judgement, log, held, layout, found)

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 
 # of full scale: half the range of a stuck cell's reading, the dither of a converter
 TOLERANCE = 0.005
+_ROUNDING = 1e-6
 
 
 def tolerance_of(recordings: Sequence[NDArray[np.float64]], layout: SensorLayout) -> float:
@@ -29,6 +30,12 @@ def converter_step(recordings: Sequence[NDArray[Any]], layout: SensorLayout) -> 
     """Return the smallest difference of two readings, 0 without any."""
     readings = RecordingBlocks.of(recordings)
     sample = readings.thinned(spread(np.flatnonzero(layout.present)))
-    steps = np.diff(np.unique(sample[np.isfinite(sample)]))
-    steps = steps[steps > 1e-6 * layout.full_scale]  # smaller differences are rounding
+    return least_step(sample[np.isfinite(sample)], layout.full_scale)
+
+
+def least_step(values: NDArray[Any], scale: float) -> float:
+    """Return the smallest difference of two values, 0 without any; what is less than a millionth of
+    the ``scale`` is rounding."""
+    steps = np.diff(np.unique(values))
+    steps = steps[steps > _ROUNDING * scale]
     return float(steps.min()) if len(steps) else 0.0

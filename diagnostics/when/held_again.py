@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from diagnostics.preprocessing.levels import LIGHT, LOW
+from diagnostics.preprocessing.tolerance import least_step
 from diagnostics.when.spans import Spans
 
 if TYPE_CHECKING:
@@ -31,7 +32,6 @@ if TYPE_CHECKING:
 _RECORDINGS = 3  # with the same value; of few counts, two agree by chance
 _BESIDE = 2  # cells that move
 _STEPS = 3  # of the converter: the noise of a cell at rest
-_ROUNDING = 1e-6  # of the range of all readings
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -52,10 +52,12 @@ def held_again(spans: Spans, layout: SensorLayout) -> Bools:
     rest = _rest(low, high, known)
     loads = np.fmax(np.abs(high - rest), np.abs(low - rest))
     light = LIGHT * float(np.quantile(loads[known], 1 - LOW))
+    extremes = np.concatenate([low[known], high[known]])
+    step = least_step(extremes, float(np.ptp(extremes)))
     with np.errstate(invalid="ignore"):
         moves = known & (high - low > light)
         away = np.abs(low - rest)
-        holds = known & (high == low) & (away > light) & (away > _STEPS * _step(low, high, known))
+        holds = known & (high == low) & (away > light) & (away > _STEPS * step)
     beside = np.where(layout.beside >= 0, moves[:, layout.beside], False).sum(axis=2)
     return _again(holds & (beside >= _BESIDE), low)
 
@@ -74,16 +76,6 @@ def _rest(low: Floats, high: Floats, known: Bools) -> Floats:
     ordered = np.sort(highest if falls else lowest, axis=0)
     place = int(LOW * (len(ordered) - 1))
     return np.asarray(ordered[-1 - place] if falls else ordered[place])
-
-
-def _step(low: Floats, high: Floats, known: Bools) -> float:
-    """Return the step of the converter: the least difference of two extremes, 0 without any."""
-    values = np.unique(np.concatenate([low[known], high[known]]))
-    steps = np.diff(values)
-    steps = steps[steps > _ROUNDING * (values[-1] - values[0])]
-    if not len(steps):
-        return 0.0
-    return float(steps.min())
 
 
 def _again(holds: Bools, value: Floats) -> Bools:

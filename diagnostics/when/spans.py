@@ -47,8 +47,7 @@ class Spans:
         """
         if list(pieces) == list(lengths):
             return self
-        ends = np.cumsum(pieces)
-        begins = np.searchsorted(ends, np.cumsum(lengths) - np.array(lengths), side="right")
+        begins = first_pieces(pieces, lengths)
         return Spans(np.fmin.reduceat(self.low, begins), np.fmax.reduceat(self.high, begins))
 
     def loads(self, load: LoadDirection) -> Spans:
@@ -80,3 +79,11 @@ class Spans:
     def middles(self) -> Floats:
         """Middle of the readings, ``[n, D]``; NaN without any."""
         return (self.high + self.low) / 2
+
+
+def first_pieces(pieces: Sequence[int], lengths: Sequence[int]) -> NDArray[np.intp]:
+    """Return the number of the first piece of each recording; arguments as for
+    :meth:`Spans.whole`."""
+    begins = np.cumsum(lengths) - np.array(lengths)
+    found: NDArray[np.intp] = np.searchsorted(np.cumsum(pieces), begins, side="right")
+    return found

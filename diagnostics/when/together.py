@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from diagnostics.preprocessing.levels import LIGHT, LOW, MAJORITY
-from diagnostics.when.spans import Spans
+from diagnostics.when.spans import Spans, first_pieces
 
 if TYPE_CHECKING:
     from diagnostics.layout import SensorLayout
@@ -67,9 +67,7 @@ class Together:
         :meth:`Spans.whole`."""
         if list(pieces) == list(lengths):
             return self
-        ends = np.cumsum(pieces)
-        begins = np.searchsorted(ends, np.cumsum(lengths) - np.array(lengths), side="right")
-        return Together(np.add.reduceat(self.sums, begins, axis=1))
+        return Together(np.add.reduceat(self.sums, first_pieces(pieces, lengths), axis=1))
 
     def of_cells(self, cells: NDArray[np.intp]) -> Together:
         """Return the sums of some cells."""

@@ -6,42 +6,24 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from pressed_recordings import FRAMES, LAYOUT, REST, presses
 
 from diagnostics import FaultKind, Line, SelfDiagnosis, SensorLayout, Verdict
 from diagnostics.model.conditional_mean import ConditionalMean, Tile
 from diagnostics.model.lines import cells_on
 from diagnostics.simulation.circuit import Circuit, StuckCell
 
-LAYOUT = SensorLayout(1, 8, 8, full_scale=4095.0, rate=20.0, unit="count")
-FRAMES = 60
-REST = 40.0
-
-
-def presses(seed: int, recordings: int) -> list[np.ndarray]:
-    """Presses that come and go anywhere, in whole counts with noise."""
-    rng = np.random.default_rng(seed)
-    rows, cols = np.divmod(np.arange(64), 8)
-    found = []
-    for _ in range(recordings):
-        total = np.zeros((FRAMES, 64))
-        for _ in range(3):
-            row, col = rng.uniform(0, 7, 2)
-            shape = np.exp(-((rows - row) ** 2 + (cols - col) ** 2) / 4)
-            begin = int(rng.integers(0, FRAMES - 30))
-            total[begin : begin + 30] += 3000 * np.sin(np.linspace(0, np.pi, 30))[:, None] * shape
-        noise = rng.normal(0, 2, total.shape)
-        found.append(np.clip(REST + total + noise, 0, 4095).round())
-    return found
+LENGTH = 30  # frames of a press
 
 
 @pytest.fixture(scope="module")
 def fitted() -> SelfDiagnosis:
-    return SelfDiagnosis(LAYOUT, engine="model").fit(presses(0, 80))
+    return SelfDiagnosis(LAYOUT, engine="model").fit(presses(0, 80, LENGTH))
 
 
 @pytest.fixture
 def log() -> list[np.ndarray]:
-    return presses(1, 30)
+    return presses(1, 30, LENGTH)
 
 
 @pytest.fixture(scope="module")
@@ -126,7 +108,7 @@ def test_a_line_that_fails_in_the_last_recordings_is_told_with_the_first_of_them
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_no_line_fails_in_a_healthy_log_nor_beside_dead_cells(fitted, seed):
-    log = presses(seed, 20)
+    log = presses(seed, 20, LENGTH)
     assert not fitted.diagnose(log).faults
     dead = np.random.default_rng(seed).choice(64, 10, replace=False)
     for frames in log:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from pressed_recordings import LAYOUT, REST, presses
 from sklearn.base import clone
 
 from diagnostics import (
@@ -11,35 +12,13 @@ from diagnostics import (
     FaultKind,
     Monitor,
     SelfDiagnosis,
-    SensorLayout,
     Verdict,
     inject,
 )
 from diagnostics.model import Model, fit_model
 from diagnostics.model.ways import WAYS
 
-LAYOUT = SensorLayout(1, 8, 8, full_scale=4095.0, rate=20.0, unit="count")
-REST = 40.0
 USED = (18, 27, 36, 45)  # cells in the middle, which presses reach often
-
-
-def presses(seed: int, recordings: int, frames: int = 60) -> list[np.ndarray]:
-    """Presses that come and go anywhere, in whole counts with noise."""
-    rng = np.random.default_rng(seed)
-    rows, cols = np.divmod(np.arange(64), 8)
-    found = []
-    for _ in range(recordings):
-        total = np.zeros((frames, 64))
-        for _ in range(3):
-            row, col = rng.uniform(0, 7, 2)
-            shape = np.exp(-((rows - row) ** 2 + (cols - col) ** 2) / 4)
-            begin = int(rng.integers(0, frames - 20))
-            course = np.zeros(frames)
-            course[begin : begin + 20] = np.sin(np.linspace(0, np.pi, 20))
-            total += 3000 * course[:, None] * shape
-        noise = rng.normal(0, 2, total.shape)
-        found.append(np.clip(REST + total + noise, 0, 4095).round())
-    return found
 
 
 @pytest.fixture(scope="module")

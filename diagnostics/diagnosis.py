@@ -645,7 +645,7 @@ class SelfDiagnosis:
             aliases=aliases,
             still=still,
             shown=shown(judgement),
-            contradicting=judgement.disturbed,
+            contradicting=float(judgement.disturbed[model.present].mean()),
             evidence=evidence,
             pulled=partial(model.lines.pulled, judgement.observed),
         )

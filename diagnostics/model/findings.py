@@ -45,14 +45,15 @@ def findings(
     noisy = frames.excess & delivers
     if log.step:  # of a coarser converter: loads come and go in one
         blinks = np.zeros_like(blinks)
-    if judgement.disturbed:
-        faulty = faulty & (log.run >= HELD)
-        probability = np.where(delivers & ~faulty, np.minimum(probability, 0.5), probability)
-        blinks = np.zeros_like(blinks)
-        noisy = np.zeros_like(noisy)
+    disturbed = judgement.disturbed
+    faulty &= ~disturbed | (log.run >= HELD)
+    unknown = delivers & disturbed & ~faulty
+    probability = np.where(unknown, np.minimum(probability, 0.5), probability)
+    blinks &= ~disturbed
+    noisy &= ~disturbed
     # a line that fails as a whole explains what its cells do
     failing = judgement.failing
-    on_line = delivers & failing.cells & (judgement.disturbed == 0)
+    on_line = delivers & failing.cells & ~disturbed
     blinks &= ~on_line
     noisy &= ~on_line
     by_frames = blinks | noisy
@@ -72,7 +73,7 @@ def findings(
     # not certain one by one: the cells of a line that fails now and then fail together
     comes_and_goes = (kind >= 0) & (kind < len(OF_WIRES))
     likely = (judgement.evidence.max(axis=0) > 0) & ~shown(judgement)
-    unsure = delivers & log.far & ~faulty & comes_and_goes & likely & (judgement.disturbed == 0)
+    unsure = delivers & log.far & ~faulty & comes_and_goes & likely & ~disturbed
     zero = np.zeros_like(present)
     nothing = np.full(len(present), np.nan)
     return CellFindings(

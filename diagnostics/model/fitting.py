@@ -132,7 +132,7 @@ def fit_model(
     if len(recordings) < FEWEST or not living.any():
         return None
     rest = fit_rest(record, full, converter_step(recordings, layout), layout.pad_of, living)
-    above = rest.above(record, living)
+    above = rest.above(record, rest.shared(record, living).offset)
     symbols = Symbols.fit(above, rest, living)
     load = root_load(above, rest)
     level = symbols.levels(record, above)

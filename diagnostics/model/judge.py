@@ -6,9 +6,10 @@ as the others say join them. With w the ways to fail and their evidence E_w,
 
     log odds = log (p / (1 - p)) + log sum over w of  prior_w exp(E_w)
 
-where the prevalence p is that of the log (EM, shrunk to a usual one). Where many of the cells that
-move are refuted, or trusted ones are odd again and again, the whole array does what the reference
-never saw: nobody is blamed for it.
+where the prevalence p is that of the log (EM, shrunk to a usual one). A pad may share what the
+reference never saw: an offset, noise, coarse steps. How its cells move then tells nothing of them,
+and only what holds a value is faulty. So it is with all cells, where many of those that move are
+refuted, or trusted ones are odd again and again.
 """
 
 from __future__ import annotations
@@ -64,8 +65,8 @@ class Judgement:
         observed: what these say of the log.
         units: of the log.
         failing: lines and groups that fail now and then.
-        disturbed: share of the cells that move which are refuted, or of the units in which trusted
-            cells are odd, where it is so large that no cell that moves is faulty; else 0.
+        disturbed: bool, cells of which only a held value tells: all do what the reference never
+            saw.
     """
 
     evidence: Array
@@ -76,7 +77,7 @@ class Judgement:
     observed: Observed
     units: Units
     failing: Failing
-    disturbed: float
+    disturbed: Mask
 
 
 @dataclass
@@ -175,31 +176,53 @@ class Model:
         if explained is not None:
             log.received &= ~explained
             log.far &= ~explained
-        of_groups = self.groups.failing(log, log.far & self.living)
+        of_groups = self._failing_groups(log)
+        log.disturbed = self._disturbed(log, of_groups)
         observed = self._by_trusted(log, of_groups.cells)
         moving = self.moving(log)
-        telling = moving & ~self._by_itself(observed, moving)
+        telling = moving & ~self._by_itself(observed, moving) & ~log.disturbed
         failing = self.lines.failing(observed, moving, telling, of_groups)
         if (failing.cells & ~of_groups.cells).any():
             observed = self._by_trusted(log, failing.cells)
         units = replace(Units.of(observed, self.odd), goes=_GOES)
         evidence = np.stack([way.evidence(observed, units) for way in WAYS])
         evidence = self._certain(evidence, units)
-        log_odds: Floats = logit(_PREVALENCE) + _of_any(evidence, WAYS)
         # what never moved, here or in the reference, and rests: nothing is known of it
         judged = log.received & (self.living | (log.level[-1] > 0))
-        probability = np.where(judged, _with_prevalence(log_odds, judged), 0.0)
+        disturbed = log.disturbed
+        counts = _counting(evidence, WAYS, disturbed)
+        log_odds = logit(_PREVALENCE) + _of_any(counts, WAYS)
+        if self._odd_as_a_whole(observed, log_odds > 0, log.far & ~failing.cells):
+            disturbed = np.ones_like(disturbed)
+            counts = _counting(evidence, WAYS, disturbed)
+            log_odds = logit(_PREVALENCE) + _of_any(counts, WAYS)
         return Judgement(
             evidence=evidence,
             log_odds=log_odds,
-            probability=probability,
-            way=_likeliest(evidence),
+            probability=np.where(judged, _with_prevalence(log_odds, judged), 0.0),
+            way=_likeliest(counts),
             known=observed.known,
             observed=observed,
             units=units,
             failing=failing,
-            disturbed=self._disturbed(observed, probability, log.far & ~failing.cells),
+            disturbed=disturbed,
         )
+
+    def _failing_groups(self, log: Log) -> Failing:
+        """Return the groups that fail, unless all others are disturbed as well."""
+        found = self.groups.failing(log, log.far & self.living)
+        if self._disturbed(log, found).all():
+            return Failing.none(len(self.present))
+        return found
+
+    def _disturbed(self, log: Log, failing: Failing) -> Mask:
+        """Return the cells of disturbed pads, bool ``[D]``, without those that are ``failing`` as a
+        whole; all cells, where those of many pads are."""
+        telling = log.received & self.living & ~failing.cells
+        found = log.disturbed & ~failing.cells
+        if found[telling].sum() > _DISTURBED * telling.sum():
+            return np.ones_like(found)
+        return found
 
     def _by_itself(self, observed: Observed, moving: Mask) -> Mask:
         """Return the ``moving`` cells that move by themselves and do not just come and go, bool
@@ -227,7 +250,8 @@ class Model:
         limits of healthy cells and without: these say who is suspect, not who is worse."""
         deciding = [i for i, way in enumerate(WAYS) if way.decides]
         ways = [WAYS[i] for i in deciding]
-        each = np.stack([way.evidence(observed, units) for way in ways])
+        every = np.stack([way.evidence(observed, units) for way in ways])
+        each = _counting(every, ways, observed.log.disturbed)
         return _of_any(self._certain(each, units, deciding), ways), _of_any(each, ways)
 
     def _by_trusted(self, log: Log, out: Mask) -> Observed:
@@ -275,16 +299,22 @@ class Model:
         return found
 
     @staticmethod
-    def _disturbed(observed: Observed, probability: Floats, alone: Mask) -> float:
-        """Return the share of the cells that move ``alone`` (bool ``[D]``) which are refuted, or of
-        the units in which trusted cells are odd."""
-        refuted = alone & (observed.log.run < HELD) & (probability > 0.5)
-        share = float(refuted.sum() / max(1, alone.sum()))
-        if refuted.sum() >= _FEWEST and share > _DISTURBED:
-            return share
+    def _odd_as_a_whole(observed: Observed, suspect: Mask, alone: Mask) -> bool:
+        """Return whether many of the cells that move ``alone`` are ``suspect``, bool ``[D]`` each,
+        or trusted ones odd in many units."""
+        refuted = alone & (observed.log.run < HELD) & suspect
+        if refuted.sum() >= _FEWEST and refuted.sum() > _DISTURBED * alone.sum():
+            return True
         odd = observed.odd[:, observed.known].mean(axis=0)
-        strange = float(np.quantile(odd, _MOST_CELLS)) if len(odd) >= _FEWEST else 0.0
-        return strange if strange > _STRANGE * USUAL else 0.0
+        return len(odd) >= _FEWEST and bool(np.quantile(odd, _MOST_CELLS) > _STRANGE * USUAL)
+
+
+def _counting(evidence: Array, ways: Sequence[Way], disturbed: Mask) -> Array:
+    """Return the evidence ``[ways, D]`` that counts: of ``disturbed`` cells (bool ``[D]``) that of
+    a held value alone is more than nothing."""
+    moves = np.array([way.kind is not None for way in ways])
+    found: Array = np.where(moves[:, None] & disturbed, np.minimum(evidence, 0), evidence)
+    return found
 
 
 def _of_any(evidence: Array, ways: Sequence[Way]) -> Array:

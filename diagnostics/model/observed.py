@@ -34,6 +34,8 @@ class Log:
         received: bool ``[D]``, cells that deliver readings.
         far: bool ``[D]``, those that move by more than a dither.
         above: readings above rest ``[n, D]``, without what the pad shares.
+        disturbed: bool ``[D]``, cells of pads that share what the reference never saw: an offset, a
+            drift, noise, or coarse steps.
         step: of the converter, where it is coarser than that of the reference; else 0.
         load: root loads ``[n, D]``.
         level, flat, before: int ``[n, D]``.
@@ -52,9 +54,12 @@ class Log:
         highest = np.fmax.reduce(record.high)
         self.received = present & record.received.any(axis=0)
         self.far = self.received & (highest - lowest > DITHER * rest.full)
-        self.above = rest.above(record, living & self.received)
-        unsure, self.step = rest.unsure(record, self.above, living & self.received)
+        telling = living & self.received
+        shared = rest.shared(record, telling)
+        self.above = rest.above(record, shared.offset)
+        unsure, self.step = rest.unsure(record, self.above, shared.drift, telling)
         wider = unsure > rest.near
+        self.disturbed: Mask = shared.unseen | wider | (self.step > 0)
         self.above = np.where(wider & (np.abs(self.above) <= unsure), 0, self.above)
         self.load = root_load(self.above, rest)
         doubt = np.where(wider, unsure, rest.near / 2)
@@ -157,8 +162,10 @@ class Observed:
 
     def constancy(self, *, dithers: bool) -> Array:
         """Return the log ratio ``[n, D]`` of how flat a piece is, given the one before, where a
-        cell holds its value: nothing where no known cell moves."""
+        cell holds its value: nothing where no known cell moves, or steps are coarser."""
         log = self.log
+        if log.step:
+            return np.zeros_like(self.of_level, np.float32)
         moves = ((log.flat == MOVES) & self.known).any(axis=1)
         healthy = self._shared(self.flatness.of_chain(self.group, log.before, log.flat))
         ratio = _LOOKS[int(dithers)][log.flat] - healthy

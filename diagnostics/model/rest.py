@@ -46,8 +46,24 @@ _QUIET = 0.3  # quantile of the changes between two pieces: a cell that no load 
 _OF_DEVIATION = 0.545  # this quantile of a normal deviate's changes
 _USUALLY = 0.95  # of the pieces
 _NOISIER = 2.0  # times as noisy, or coarse, as the reference
+_UNSEEN = 1.5  # times what the reference usually shows: it never saw as much
 _WITHIN = 4.0  # standard deviations
 _UNSTEADY = 0.05  # of full scale: the rest of a cell differs between recordings by less
+
+
+@dataclass(frozen=True)
+class Shared:
+    """What the pads of a log share.
+
+    Attributes:
+        drift: by how much each cell rests higher than it did in the reference, ``[n, D]``.
+        offset: by how much it reads more than at rest without a load, ``[n, D]``.
+        unseen: bool ``[D]``, cells of pads on which the reference never saw as much.
+    """
+
+    drift: Array
+    offset: Array
+    unseen: Mask
 
 
 @dataclass(frozen=True)
@@ -78,17 +94,17 @@ class Rest:
     drifts: Array
     step: float = 0.0
 
-    def offset(self, record: Record, telling: Mask) -> Array:
-        """Return by how much each cell reads more than at rest without a load, ``[n, D]``;
-        ``telling``: bool ``[D]``, cells that are received and live."""
+    def shared(self, record: Record, telling: Mask) -> Shared:
+        """Return what the pads of a log share; ``telling``: bool ``[D]``, cells that are received
+        and live."""
         drift = self.drift(record, telling)
         of_pads = self.of_pads(record, telling, drift)
         share = _share(record.mean - self.level - drift, of_pads, self.near, self.share)
         # what the reference shows tells more, unless it never saw as much
-        unseen = _usually(of_pads) > _NOISIER * self.offsets
+        unseen = _usually(of_pads) > _UNSEEN * self.offsets
         share = np.where(unseen, share, self.share).astype(np.float32)
-        found: Array = drift + share * of_pads
-        return found
+        unseen |= (drift != 0).any(axis=0)
+        return Shared(drift, drift + share * of_pads, unseen)
 
     def of_pads(self, record: Record, telling: Mask, drift: Array | float = 0.0) -> Array:
         """Return the offset of each cell's pad in each piece, ``[n, D]``, beside the ``drift`` of
@@ -157,30 +173,39 @@ class Rest:
         found: Mask = away & (ranges <= DITHER * self.full)
         return found
 
-    def above(self, record: Record, telling: Mask) -> Array:
-        """Return how far each piece reads above the rest of the cell without what its pad shares,
-        ``[n, D]``. Cells that share less than others read more, those that share more no less."""
-        offset = self.offset(record, telling)
+    def above(self, record: Record, offset: Array) -> Array:
+        """Return how far each piece reads above the rest of the cell without the ``offset`` that
+        its pad shares, ``[n, D]`` each. Cells that share less than others read more, those that
+        share more no less."""
         above = record.mean - self.level - offset
         uneven = _EVEN * np.maximum(-offset, 0)
         found: Array = np.where(above < 0, np.minimum(above + uneven, 0), above)
         return found
 
-    def unsure(self, record: Record, above: Array, telling: Mask) -> tuple[Array, float]:
+    def unsure(
+        self, record: Record, above: Array, drift: Array, telling: Mask
+    ) -> tuple[Array, float]:
         """Return how far above or below rest a cell reads without a load in this log, ``[D]``, and
         the step of its converter: ``near``, or more where the pad is noisier than in the reference,
-        or the converter coarser. ``above``: readings above rest ``[n, D]``."""
+        or the converter coarser.
+
+        Args:
+            record: of the log.
+            above: readings above rest ``[n, D]``.
+            drift: as :meth:`drift` returns it.
+            telling: bool ``[D]``, cells that are received and live.
+        """
         step = _step(record, telling, DITHER * self.full, 1e-5 * self.full)
-        noise = self.noise_of(record, above, telling)
+        noise = self.noise_of(record, above, drift, telling)
         found = np.where(noise > _NOISIER * self.noise, np.maximum(self.near, noise), self.near)
         if step <= max(2 * float(np.median(self.near)), _NOISIER * self.step):
             step = 0.0
         return np.maximum(found, step).astype(np.float32), step
 
-    def noise_of(self, record: Record, above: Array, telling: Mask) -> Array:
-        """Return how far a cell reads from rest by noise, or as it drifts, ``[D]``; ``above``:
-        readings above rest ``[n, D]``."""
-        drift = self.drift(record, telling)[_blocks(record)]
+    def noise_of(self, record: Record, above: Array, drift: Array, telling: Mask) -> Array:
+        """Return how far a cell reads from rest by noise, or as it drifts, ``[D]``; arguments as
+        for :meth:`unsure`."""
+        drift = drift[_blocks(record)]
         later = _AROUND // 2
         found: Array = np.abs(drift[later:] - drift[:-later]).max(axis=0, initial=0)
         follows = ~record.first[1:]
@@ -233,7 +258,8 @@ def fit_rest(record: Record, full: float, step: float, pad: Cells, living: Mask)
         unsteady = np.minimum(spread, _UNSTEADY * full)
         near = np.fmax(least, 2 * np.fmax(noise, unsteady)).astype(np.float32)
         rest = Rest(level, near, full, high, pad, share, none, most, most, step)
-    noise = rest.noise_of(record, rest.above(record, living), living)
+    shared = rest.shared(record, living)
+    noise = rest.noise_of(record, rest.above(record, shared.offset), shared.drift, living)
     offsets = np.maximum(near, _usually(rest.of_pads(record, living)))
     drifts = _usually(replace(rest, drifts=none).drift(record, living))
     return replace(rest, noise=noise, offsets=offsets, drifts=drifts)

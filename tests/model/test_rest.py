@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from diagnostics import SensorLayout
-from diagnostics.model.record import record_of
+from diagnostics.model.record import Record, record_of
 from diagnostics.model.rest import Rest, fit_rest, shortest
 from diagnostics.preprocessing.tolerance import converter_step
 
@@ -22,6 +22,17 @@ def touched(seed: int) -> list[np.ndarray]:
         frames[12:36, pressed] += 400
         found.append(frames.round())
     return found
+
+
+def above_rest(rest: Rest, record: Record, living: np.ndarray) -> np.ndarray:
+    """Readings above rest without what the pads share, ``[n, D]``."""
+    return rest.above(record, rest.shared(record, living).offset)
+
+
+def width_of_rest(rest: Rest, record: Record, living: np.ndarray) -> tuple[np.ndarray, float]:
+    """How far a cell reads from rest without a load, ``[D]``, and the step of its converter."""
+    shared = rest.shared(record, living)
+    return rest.unsure(record, rest.above(record, shared.offset), shared.drift, living)
 
 
 @given(st.lists(st.floats(-1e3, 1e3), min_size=2, max_size=30))
@@ -42,7 +53,7 @@ def test_a_pad_that_sags_as_a_whole_is_told_by_how_much_and_the_other_is_not():
     log = touched(1)
     for frames in log:
         frames[:, 12:] -= 40
-    offset = rest.offset(record_of(log, 8), living)
+    offset = rest.shared(record_of(log, 8), living).offset
     np.testing.assert_allclose(offset[:, 12:], -40, atol=4)
     assert np.abs(offset[:, :12]).max() < 3
     np.testing.assert_allclose(rest.level, 100, atol=3)
@@ -64,7 +75,7 @@ def test_a_cell_that_shares_more_of_a_sag_than_others_reads_nothing_below_rest()
     log = touched(1)
     for frames in log:
         frames[:, 12:] -= np.linspace(30, 50, 12)
-    above = rest.above(record_of(log, 8), living)
+    above = above_rest(rest, record_of(log, 8), living)
     assert (above[:, 12:] >= -rest.near[12:]).all()
 
 
@@ -76,7 +87,7 @@ def test_cells_that_are_stuck_tell_nothing_of_where_the_others_of_their_pad_rest
     for frames in log:
         frames[:, 12:] += drift
         frames[:, 19:] = np.linspace(200, 900, 5)
-    offset = rest.offset(record_of(log, 8), living)
+    offset = rest.shared(record_of(log, 8), living).offset
     np.testing.assert_allclose(offset[:, 12:19], np.broadcast_to(drift[:7], (72, 7)), atol=6)
     np.testing.assert_allclose(offset[:, 19:], -40, atol=12)
 
@@ -96,7 +107,7 @@ def test_a_cell_that_does_not_drift_with_its_pad_is_learned_as_such(steady):
     log = touched(1)
     for frames in log:
         frames[:, 12:] += 30 * drifts
-    above = rest.above(record_of(log, 8), living)
+    above = above_rest(rest, record_of(log, 8), living)
     assert (np.abs(above[:, 12:]) <= rest.near[12:]).all()
 
 
@@ -116,7 +127,7 @@ def test_cells_that_drift_each_by_its_own_amount_rest_where_they_did(seed, most)
     rest = rest_of_reference(living)
     drift = np.concatenate([rng.permutation(np.linspace(0, most, 12)) for _ in range(2)])
     log = [frames + drift for frames in touched(1)]
-    above = rest.above(record_of(log, 8), living)
+    above = above_rest(rest, record_of(log, 8), living)
     resting = np.abs(above) < 150
     assert resting.mean() > 0.8
     assert (above[resting] <= 3 * rest.near.max()).all()
@@ -144,11 +155,11 @@ def test_a_coarser_converter_and_a_noisier_pad_widen_what_counts_as_rest(step):
     rest = rest_of_reference(living)
     log = touched(1)
     record = record_of(log, 8)
-    assert (rest.unsure(record, rest.above(record, living), living)[0] == rest.near).all()
+    assert (width_of_rest(rest, record, living)[0] == rest.near).all()
     coarse = record_of([np.floor(frames / step) * step for frames in log], 8)
-    unsure, found = rest.unsure(coarse, rest.above(coarse, living), living)
+    unsure, found = width_of_rest(rest, coarse, living)
     assert found == step
     assert (unsure >= step).all()
     noisy = record_of([frames + rng.normal(0, step, frames.shape) for frames in log], 8)
-    unsure, _ = rest.unsure(noisy, rest.above(noisy, living), living)
+    unsure, _ = width_of_rest(rest, noisy, living)
     assert (unsure > step / 2).all()

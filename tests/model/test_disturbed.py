@@ -1,0 +1,78 @@
+"""Disturbances of all cells in the one model: nobody is blamed for them, dead cells are found."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from pressed_recordings import LAYOUT, REST, presses
+
+from diagnostics import SelfDiagnosis, Verdict
+
+DEAD = (18, 27, 45)
+
+
+def _time(whole: np.ndarray) -> np.ndarray:
+    return np.arange(len(whole))[:, None]
+
+
+def _hum(whole: np.ndarray) -> np.ndarray:
+    return whole + 120 * np.sin(_time(whole) / 1.7)
+
+
+def _ramp(whole: np.ndarray) -> np.ndarray:
+    return whole + 600 * _time(whole) / len(whole)
+
+
+def _coarse(whole: np.ndarray) -> np.ndarray:
+    return np.floor(whole / 250) * 250
+
+
+def _saturates(whole: np.ndarray) -> np.ndarray:
+    return np.minimum(REST + 10 * (whole - REST), 4095)
+
+
+def _crosstalk(whole: np.ndarray) -> np.ndarray:
+    return whole + 0.5 * (whole - REST).mean(axis=1, keepdims=True)
+
+
+def _noise(whole: np.ndarray) -> np.ndarray:
+    return whole + np.random.default_rng(7).normal(0, 60, whole.shape)
+
+
+DISTURBANCES = [_hum, _ramp, _coarse, _saturates, _crosstalk, _noise]
+Disturb = Callable[[np.ndarray], np.ndarray]
+
+
+@pytest.fixture(scope="module")
+def fitted() -> SelfDiagnosis:
+    return SelfDiagnosis(LAYOUT, engine="model").fit(presses(0, 80))
+
+
+def disturbed(disturb: Disturb) -> list[np.ndarray]:
+    log = presses(3, 30)
+    whole = np.clip(disturb(np.concatenate(log)).round(), 0, 4095)
+    return np.split(whole, len(log))
+
+
+@pytest.mark.parametrize("disturb", DISTURBANCES)
+def test_nobody_is_blamed_for_what_all_cells_do(fitted, disturb):
+    assert not fitted.diagnose(disturbed(disturb)).faults
+
+
+@pytest.mark.parametrize("disturb", DISTURBANCES)
+def test_cells_that_hold_a_value_while_all_others_move_are_found(fitted, disturb):
+    log = disturbed(disturb)
+    for frames in log:
+        frames[:, DEAD] = [1500.0, 4095.0, 700.0]
+    assert list(fitted.diagnose(log).fault_set) == list(DEAD)
+
+
+@pytest.mark.parametrize("disturb", DISTURBANCES)
+def test_a_cell_that_moves_by_itself_among_them_is_not_alive(fitted, disturb):
+    log = disturbed(disturb)
+    swing = 1000 + 600 * np.sin(np.arange(30 * 60) / 9)
+    for i, frames in enumerate(log):
+        frames[:, 27] = swing[60 * i :][:60].round()
+    assert fitted.diagnose(log).verdicts[27] is not Verdict.ALIVE

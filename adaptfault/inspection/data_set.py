@@ -35,6 +35,7 @@ from adaptfault.inspection.result import Finding, Inspection
 from adaptfault.inspection.severity import Name, of_finding
 from diagnostics import SensorLayout
 from diagnostics.preprocessing.levels import MAJORITY
+from diagnostics.when import reads_enough
 
 SCHEMA = "adaptfault.check/1"
 
@@ -152,15 +153,28 @@ class DataSetCheck:
         if self.level == "quick":
             return self.left_to_check
         found = []
-        coverage = self.inspection.diagnosis.coverage
+        untested = self.inspection.diagnosis.coverage.untested
+        little = np.zeros(len(untested), bool)
+        if "reference" not in self.given:
+            moved = np.nan_to_num(self.summary.highest - self.summary.lowest)
+            little = ((moved > 0) & ~reads_enough(moved, self.layout))[untested]
         cells = int(self.layout.present.sum())
-        if len(coverage.untested):
-            places = [self.layout.place(cell) for cell in coverage.untested[:_LISTED].tolist()]
-            more = len(coverage.untested) - len(places)
-            listed = "; ".join([*places, *[f"and {more} more"] * bool(more)])
-            what = f"{len(coverage.untested)} of {cells} cells: no contact tested them ({listed})"
-            found.append(Unchecked(what, ("TOUCH-190",)))
+        for some, why in (
+            (untested[~little], "no contact tested them"),
+            (untested[little], "worn or hardly touched, they move less than half as far as others"),
+        ):
+            if len(some):
+                what = f"{len(some)} of {cells} cells: {why} ({self._places(some)})"
+                found.append(Unchecked(what, ("TOUCH-190",)))
         return (*found, *unchecked_for_want(unchecked(set(self.given))))
+
+    def _places(self, cells: NDArray[np.intp]) -> str:
+        """Return where the first cells are."""
+        places = [self.layout.place(cell) for cell in cells[:_LISTED].tolist()]
+        more = len(cells) - len(places)
+        if more:
+            places.append(f"and {more} more")
+        return "; ".join(places)
 
     def _missing_share(self) -> float:
         present = self.summary.layout.present.ravel()

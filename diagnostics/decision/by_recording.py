@@ -4,7 +4,8 @@ The whole log tells what is faulty at its end. Recordings in which cells hold a 
 beside them move (:mod:`diagnostics.when`) are diagnosed as a log of their own; what that finds
 besides shows in these recordings. Cells whose held values are certain are faulty in any case; what
 is suspect and not proven is possible, and so is what holds a value again and again
-(:mod:`diagnostics.when.held_again`).
+(:mod:`diagnostics.when.held_again`). What was not tested and reads little of what the cells on both
+sides read may be worn (:mod:`diagnostics.when.weak`).
 """
 
 from __future__ import annotations
@@ -106,6 +107,10 @@ def with_recordings(
     again[:, list(found)] = False
     possible += _again_possible(again, whole.layout)
     tested &= ~again.any(axis=0)
+    little = np.isfinite(held.share) & ~whole.tested & ~whole.disturbed.mask & ~again.any(axis=0)
+    little[list(found)] = False
+    little[unproven] = False
+    possible += _weak_possible(little, held.share, whole.layout)
     tested[[cell for fault in faults for cell in fault.cells]] = True
     result = replace(
         whole,
@@ -231,6 +236,30 @@ def _again_possible(again: NDArray[np.bool_], layout: SensorLayout) -> list[Faul
                 reason=reason,
                 evidence=len(shown),
                 recordings=shown,
+            )
+        )
+    return faults
+
+
+def _weak_possible(
+    little: NDArray[np.bool_], share: NDArray[np.float64], layout: SensorLayout
+) -> list[Fault]:
+    """Return a possible fault for each cell (bool ``[D]``) that reads a ``share`` (``[D]``) of what
+    the cells on both sides read."""
+    faults = []
+    for cell in np.flatnonzero(little).tolist():
+        reason = (
+            f"{layout.place(cell)} reads about {share[cell]:.2g} of what the cells on both sides of"
+            " it read, in nearly every contact: perhaps worn; not tested, as no reference tells"
+            " what is usual"
+        )
+        faults.append(
+            Fault(
+                FaultKind.WEAK,
+                (cell,),
+                value=float(share[cell]),
+                probability=MAJORITY,
+                reason=reason,
             )
         )
     return faults

@@ -13,6 +13,7 @@ from diagnostics.preprocessing.quantiles import known_quantile
 from diagnostics.when.held_again import held_again
 from diagnostics.when.mixture import QUIET_LEVELS, Found, Mixture, Symbol
 from diagnostics.when.spans import Spans
+from diagnostics.when.weak import shares_of_load
 
 if TYPE_CHECKING:
     from diagnostics.layout import SensorLayout
@@ -44,6 +45,8 @@ class Held:
         value: float ``[D]``, what it reads in these recordings; NaN: none.
         again: bool ``[n, D]``, where it holds a value away from rest that it holds again and again
             (:mod:`diagnostics.when.held_again`): no proof.
+        share: float ``[D]``, of what the cells on both sides read, in nearly every contact; NaN: no
+            less than usual (:mod:`diagnostics.when.weak`). No proof.
     """
 
     evidence: Floats
@@ -51,6 +54,7 @@ class Held:
     moved: Mask
     value: Floats
     again: Mask
+    share: Floats
 
     @classmethod
     def nothing(cls, spans: Spans, tolerance: float) -> Held:
@@ -62,6 +66,7 @@ class Held:
             spans.ranges > 2 * tolerance,
             np.full(n_cells, np.nan),
             np.zeros(spans.low.shape, bool),
+            np.full(n_cells, np.nan),
         )
 
     def of(self, cells: NDArray[np.intp]) -> Held:
@@ -72,6 +77,7 @@ class Held:
             self.moved[:, cells],
             self.value[cells],
             self.again[:, cells],
+            self.share[cells],
         )
 
     @property
@@ -113,7 +119,8 @@ def find_held(
         if classes is not None:
             _, number = np.unique(np.asarray(classes), return_inverse=True)
         found = _Search(spans, layout, tolerance, number).held()
-    return replace(found, again=held_again(spans, layout))
+    share = shares_of_load(spans, layout)
+    return replace(found, again=held_again(spans, layout), share=share)
 
 
 class _Search:
@@ -207,7 +214,7 @@ class _Search:
         value = np.full(len(evidence), np.nan)
         some = np.isfinite(middles).any(axis=0)
         value[some] = np.nanmedian(middles[:, some], axis=0)
-        return Held(evidence, suspect, self._moved, value, self._nothing.again)
+        return replace(self._nothing, evidence=evidence, suspect=suspect, value=value)
 
     def _symbols(self, layout: SensorLayout) -> NDArray[np.intp]:
         """Return the symbol of each cell in each recording, ``[n, D]``."""

@@ -67,7 +67,8 @@ def test_whatever_is_suspect_is_faulty_or_told_as_possible_and_untested(cells, w
     suspect[np.ix_(sorted(where), cells)] = True
     of_cells = np.where(suspect.any(axis=0), evidence, -np.inf)
     value = np.where(suspect.any(axis=0), 0.0, np.nan)
-    held = Held(of_cells, suspect, ~suspect, value, np.zeros_like(suspect))
+    again = np.zeros_like(suspect)
+    held = Held(of_cells, suspect, ~suspect, value, again, np.full(suspect.shape[1], np.nan))
     whole = Diagnosis(LAYOUT, (), np.zeros(64), np.ones(64, bool), 1000, n_recordings=20)
     told = with_recordings(whole, held, [50] * 20, 0.01, None)
     possible = {cell for fault in told.possible for cell in fault.cells}

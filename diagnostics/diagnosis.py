@@ -635,6 +635,8 @@ class SelfDiagnosis:
         # what a pad shares looks alike on lines that nothing touches
         doubtful = (found.probability >= DOUBTED)[self._place]
         aliases = [fault for fault in aliases if doubtful[list(fault.cells)].any()]
+        # lines of one cell each: which of the two is the copy is told by the model
+        aliases = [fault for fault in aliases if len(fault.cells) > 2]
         evidence = {
             "spatial": found.weight,
             "temporal": np.zeros(len(found.weight)),
@@ -709,6 +711,7 @@ class SelfDiagnosis:
         causes, possible = root_causes(found, judged.aliases, self.layout)
         contradicted = judged.contradicting > 0
         unused = self._unused(stream, found.alive, causes, contradicted=contradicted)
+        unused &= found.refuted < 0  # what moves by itself does not rest
         if unused.any():
             found = found.without(unused)
             causes, possible = root_causes(found, judged.aliases, self.layout)

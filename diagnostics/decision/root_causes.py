@@ -32,6 +32,11 @@ REFUTED_KINDS = (
     FaultKind.WEAK,
 )
 
+_HELD = (FaultKind.OPEN, FaultKind.SHORT, FaultKind.STUCK)
+
+# Faults of a wire that all cells on it show, touched or not.
+_WITHOUT_CONTACT = (*_HELD, FaultKind.FLOATING)
+
 # Those that a wire has which fails now and then, as one that opens under load.
 OF_WIRES = REFUTED_KINDS[:2]
 
@@ -206,11 +211,12 @@ def _causes(
         # A working cell contradicts a broken wire; so does one with another fault, or another
         # value.
         contradicting = found.alive | (found.faulty & ~consistent) | aliased
-        if kind in (FaultKind.OPEN, FaultKind.SHORT, FaultKind.STUCK):
+        if kind in _HELD:
             # A cell that became constant before the wire broke does not contradict it.
             leading = faulty if faulty.any() else consistent & (found.weight >= SUSPICIOUS)
             begun = int(np.median(found.since[leading])) if leading.any() else 0
             contradicting &= ~(consistent & ~faulty & (found.since <= begun) & (begun > 0))
+        if kind in _WITHOUT_CONTACT:
             contradicting |= ~consistent & ~found.silent
         explained = _explained(
             faulty & ~aliased, consistent & ~aliased, contradicting, found, layout, common
@@ -259,9 +265,16 @@ def _of_failing_wires(
     explained = _explained(
         faulty & ~aliased, consistent & ~aliased, contradicting, found, layout, common
     )
-    wires = [cause for cause in explained if cause.line is not None and cause.proven]
-    kinds = [OF_WIRES[int(np.median(likely[list(cause.seen)]))] for cause in wires]
-    return [(kind, None, cause) for kind, cause in zip(kinds, wires, strict=True)]
+    wires: list[tuple[FaultKind, float | None, Cause]] = []
+    for cause in explained:
+        kind = OF_WIRES[int(np.median(likely[list(cause.seen)]))]
+        # touched or not, all cells of a wire that floats do
+        floats = kind is FaultKind.FLOATING
+        if floats and len(cause.seen) <= MAJORITY * len(cause.cells):
+            continue
+        if cause.line is not None and cause.proven:
+            wires.append((kind, None, cause))
+    return wires
 
 
 def _explained(

@@ -40,6 +40,8 @@ HELD = 3  # pieces at the end at one load: it may be stuck
 _PREVALENCE = 0.03
 _WEIGHS = 20.0  # cells that the usual prevalence is worth
 _ITERATIONS = 10
+_DECIDING = [i for i, way in enumerate(WAYS) if way.decides]
+_OTHERS = [i for i, way in enumerate(WAYS) if not way.decides]
 _EXPLAINS = 0.5  # of the evidence of any way: a value that is held
 _DISTURBED = 1 / 3  # of the cells that move
 _FEWEST = 8  # cells that show a disturbance
@@ -243,26 +245,26 @@ class Model:
 
     def evidence_of_any(self, observed: Observed, units: Units) -> Array:
         """Return the evidence ``[D]`` of any of the ways that tell who is trusted."""
-        return self._told(observed, units)[0]
+        return self._told(observed, units, _DECIDING)[0]
 
-    def _told(self, observed: Observed, units: Units) -> tuple[Array, Array]:
-        """Return the evidence ``[D]`` of any of the ways that tell who is trusted, within the
-        limits of healthy cells and without: these say who is suspect, not who is worse."""
-        deciding = [i for i, way in enumerate(WAYS) if way.decides]
-        ways = [WAYS[i] for i in deciding]
+    def _told(self, observed: Observed, units: Units, chosen: Sequence[int]) -> tuple[Array, Array]:
+        """Return the evidence ``[D]`` of any of the ``chosen`` ways, within the limits of healthy
+        cells and without: these say who is suspect, not who is worse."""
+        ways = [WAYS[i] for i in chosen]
         every = np.stack([way.evidence(observed, units) for way in ways])
         each = _counting(every, ways, observed.log.disturbed)
-        return _of_any(self._certain(each, units, deciding), ways), _of_any(each, ways)
+        return _of_any(self._certain(each, units, chosen), ways), _of_any(each, ways)
 
     def _by_trusted(self, log: Log, out: Mask) -> Observed:
         """Return what those say of a log who are trusted to predict the others; those that are
-        ``out`` (bool ``[D]``) are not."""
+        ``out`` (bool ``[D]``) are not. Ways to fail that take long are asked at the end."""
         holds = (log.run >= HELD) & (log.load[-1] > NOTHING)
         stays = ~(log.received & self.living) | out
         observed = self.observed(log, self.moving(log) & ~out)
         for _ in range(_ROUNDS):
             known = observed.known
-            evidence, of_all = self._told(observed, Units.of(observed, self.odd))
+            units = Units.of(observed, self.odd)
+            evidence, of_all = self._told(observed, units, _DECIDING)
             suspect = known & (evidence > _SUSPECT)
             if suspect.any():
                 observed = self.observed(log, known & ~self._worst(suspect, known, of_all))
@@ -270,10 +272,16 @@ class Model:
             # a cell that a worse one of its pad had made look wrong comes back, but once only
             misled = ~holds & ~self._worst_of_pad(~known, of_all)
             joins = ~known & ~stays & ((evidence < 0) | misled)
-            if not joins.any():
+            if joins.any():
+                stays |= joins
+                observed = self.observed(log, known | joins)
+                continue
+            evidence, _ = self._told(observed, units, _OTHERS)
+            suspect = known & (evidence > _SUSPECT)
+            if not suspect.any():
                 break
-            stays |= joins
-            observed = self.observed(log, known | joins)
+            stays |= suspect
+            observed = self.observed(log, known & ~suspect)
         return observed
 
     def _worst(self, suspect: Mask, known: Mask, evidence: Array) -> Mask:

@@ -259,6 +259,20 @@ def test_a_wire_that_is_proved_to_fail_is_one_fault_with_all_of_its_cells():
     assert fault.cells == tuple(row.tolist())
 
 
+def test_cells_that_float_are_no_wire_where_others_on_it_are_at_rest():
+    row = LAYOUT.cells_on(Line(1, "row", 4))
+    floats = 0
+    found = replace(
+        dead(untested(HEALTHY, row[3:]), row[:3]),
+        rests=NONE,
+        refuted=np.where(at(row[:3]), floats, -1),
+    )
+    faults, possible = root_causes(found, (), LAYOUT)
+    assert not possible
+    blamed = [cell for fault in faults for cell in fault.cells]
+    assert blamed == row[:3].tolist()
+
+
 def test_cells_that_deliver_nothing_are_open_and_have_no_value():
     found = replace(dead(HEALTHY, [7]), silent=at([7]), rests=NONE, value=np.full(CELLS, np.nan))
     (fault,) = causes(found)

@@ -1,6 +1,8 @@
 """Healthy up to a limit, and at it whatever the others say is more.
 
-Not detected: a limit above what the log reaches, or near the top.
+A load one level further up counts as at the limit: the loads of a healthy cell end somewhere, too.
+
+Not detected: a limit above what the log reaches, or near the top; one a level below the loads.
 """
 
 from __future__ import annotations
@@ -12,6 +14,8 @@ from diagnostics.model.observed import Observed
 from diagnostics.model.over_time import Units, throughout
 from diagnostics.model.record import Array
 from diagnostics.model.ways.way import Way
+
+_NEAR = 2  # levels that may end at the limit
 
 
 def _limit(observed: Observed) -> Array:
@@ -26,10 +30,13 @@ def _evidence(observed: Observed, units: Units) -> Array:
     at = (log.record.high >= limit - symbols.rest.full * 1e-5) & (log.level > 0)
     at &= limit < symbols.rest.high - symbols.tolerance
     loads = observed.levels[..., : symbols.top + 1]
-    beyond = np.flip(np.cumsum(np.flip(loads, -1), -1), -1)
+    at_least = np.flip(np.cumsum(np.flip(loads, -1), -1), -1)
+    at_least = np.pad(at_least, ((0, 0), (0, 0), (0, _NEAR)))
     level = np.minimum(log.level, symbols.top)[..., None].astype(np.intp)
-    more = np.log(np.take_along_axis(beyond, level, 2)[..., 0])
-    ratio = np.where(at, more - observed.of_level, 0)
+    more = np.take_along_axis(at_least, level, 2)[..., 0]
+    much_more = np.take_along_axis(at_least, level + _NEAR, 2)[..., 0]
+    near = np.log(np.maximum(more - much_more, np.exp(observed.of_level)))
+    ratio = np.where(at, np.log(more) - near, 0)
     return throughout(ratio * log.record.received, units)
 
 

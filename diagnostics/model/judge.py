@@ -190,7 +190,7 @@ class Model:
         evidence = np.stack([way.evidence(observed, units) for way in WAYS])
         evidence = self._certain(evidence, units)
         # what never moved, here or in the reference, and rests: nothing is known of it
-        judged = log.received & (self.living | (log.level[-1] > 0))
+        judged = log.received & (self.living | (log.level[-1] > 0)) & ~log.overloaded
         disturbed = log.disturbed
         counts = _counting(evidence, WAYS, disturbed)
         log_odds = logit(_PREVALENCE) + _of_any(counts, WAYS)

@@ -35,7 +35,9 @@ class Log:
         far: bool ``[D]``, those that move by more than a dither.
         above: readings above rest ``[n, D]``, without what the pad shares.
         disturbed: bool ``[D]``, cells of pads that share what the reference never saw: an offset, a
-            drift, noise, or coarse steps.
+            drift, noise, coarse steps, or a top that loads reach.
+        saturated: whether any load may read as the top.
+        overloaded: bool ``[D]``, cells that end there, having moved.
         step: of the converter, where it is coarser than that of the reference; else 0.
         load: root loads ``[n, D]``.
         level, flat, before: int ``[n, D]``.
@@ -57,9 +59,13 @@ class Log:
         telling = living & self.received
         shared = rest.shared(record, telling)
         self.above = rest.above(record, shared.offset)
-        unsure, self.step = rest.unsure(record, self.above, shared.drift, telling)
+        noise = rest.noise_of(record, self.above, telling)
+        unsure, self.step = rest.unsure(record, noise, shared.drift, telling)
         wider = unsure > rest.near
-        self.disturbed: Mask = shared.unseen | wider | (self.step > 0)
+        self.saturated = rest.saturates(record, self.above, telling & self.far)
+        self.disturbed: Mask = shared.unseen | rest.noisier(noise)
+        if self.step or self.saturated:
+            self.disturbed = np.ones_like(self.disturbed)
         self.above = np.where(wider & (np.abs(self.above) <= unsure), 0, self.above)
         self.load = root_load(self.above, rest)
         doubt = np.where(wider, unsure, rest.near / 2)
@@ -76,6 +82,8 @@ class Log:
         high = self.value + symbols.tolerance
         self.holds = (record.low >= low) & (record.high <= high)
         self._alone: Array | None = None
+        ends_at_top = self.level[-1] == symbols.top
+        self.overloaded: Mask = self.far & ends_at_top & self.saturated
         at_end = np.logical_and.accumulate(np.flip(self.holds, 0), 0)
         self.run = at_end.sum(axis=0)
 
@@ -92,6 +100,10 @@ class Log:
     def likelihood(self, levels: Array, lag: int = 0) -> Array:
         """Return log P of each piece from ``lag`` on by P(level) ``[n - lag, D, K]``: of the
         likeliest level that the reading may have."""
+        if self.saturated:
+            top = self.symbols.top
+            levels = levels.copy()
+            levels[..., top] = levels[..., 1 : top + 1].sum(axis=-1)
         chosen = self.either[:, lag:, :, None].astype(np.intp)
         found: Array = np.log(np.take_along_axis(levels[None], chosen, 3)[..., 0].max(axis=0))
         return found
@@ -162,14 +174,17 @@ class Observed:
 
     def constancy(self, *, dithers: bool) -> Array:
         """Return the log ratio ``[n, D]`` of how flat a piece is, given the one before, where a
-        cell holds its value: nothing where no known cell moves, or steps are coarser."""
+        cell holds its value: nothing where no known cell moves, at rest where steps are coarser,
+        or at a top that any load reaches."""
         log = self.log
-        if log.step:
-            return np.zeros_like(self.of_level, np.float32)
         moves = ((log.flat == MOVES) & self.known).any(axis=1)
         healthy = self._shared(self.flatness.of_chain(self.group, log.before, log.flat))
         ratio = _LOOKS[int(dithers)][log.flat] - healthy
         tells = log.holds & (log.flat != MOVES) & moves[:, None]
+        if log.step:
+            tells &= log.level > 0
+        if log.saturated:
+            tells &= log.level != log.symbols.top
         found: Array = np.where(tells, ratio, 0).astype(np.float32)
         return found
 

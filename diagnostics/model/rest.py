@@ -36,6 +36,7 @@ _EVEN = 0.5  # of a negative offset: by which the cells that share it differ
 _NOISES = 3.0  # by which those that share a positive one differ; a contact may be even, too
 _RESTS = 0.25  # share of the recordings in which a cell rests at some time, at least
 _WIDER = 8.0  # than their interval is the spread of all, where these rest and others do not
+_LASTS = 0.25  # share of the pieces in which a pad has drifted, at least
 _ROUNDS = 3
 _SURE = 20.0  # pieces that a share of 1 is worth
 _MOST = 2.0  # share of the offset of a pad that a cell shows in a log; in the reference 1
@@ -47,6 +48,8 @@ _OF_DEVIATION = 0.545  # this quantile of a normal deviate's changes
 _USUALLY = 0.95  # of the pieces
 _NOISIER = 2.0  # times as noisy, or coarse, as the reference
 _UNSEEN = 1.5  # times what the reference usually shows: it never saw as much
+_APART = 10.0  # times what n readings of a range are apart at least, range / n^2: by steps
+_SATURATES = 0.1  # of the loaded readings of a usual cell are at the top
 _WITHIN = 4.0  # standard deviations
 _UNSTEADY = 0.05  # of full scale: the rest of a cell differs between recordings by less
 
@@ -81,6 +84,7 @@ class Rest:
         offsets: ``[D]``, offset of its pad that few pieces of the reference exceed.
         drifts: ``[D]``, by how much it rests higher or lower in parts of the reference.
         step: of the converter.
+        at_top: share of the loaded readings of a usual cell that are at the top.
     """
 
     level: Array
@@ -93,6 +97,7 @@ class Rest:
     offsets: Array
     drifts: Array
     step: float = 0.0
+    at_top: float = 0.0
 
     def shared(self, record: Record, telling: Mask) -> Shared:
         """Return what the pads of a log share; ``telling``: bool ``[D]``, cells that are received
@@ -103,7 +108,7 @@ class Rest:
         # what the reference shows tells more, unless it never saw as much
         unseen = _usually(of_pads) > _UNSEEN * self.offsets
         share = np.where(unseen, share, self.share).astype(np.float32)
-        unseen |= (drift != 0).any(axis=0)
+        unseen |= (drift != 0).mean(axis=0) > _LASTS
         return Shared(drift, drift + share * of_pads, unseen)
 
     def of_pads(self, record: Record, telling: Mask, drift: Array | float = 0.0) -> Array:
@@ -183,7 +188,7 @@ class Rest:
         return found
 
     def unsure(
-        self, record: Record, above: Array, drift: Array, telling: Mask
+        self, record: Record, noise: Array, drift: Array, telling: Mask
     ) -> tuple[Array, float]:
         """Return how far above or below rest a cell reads without a load in this log, ``[D]``, and
         the step of its converter: ``near``, or more where the pad is noisier than in the reference,
@@ -191,23 +196,46 @@ class Rest:
 
         Args:
             record: of the log.
-            above: readings above rest ``[n, D]``.
+            noise: as :meth:`noise_of` returns it, ``[D]``.
             drift: as :meth:`drift` returns it.
             telling: bool ``[D]``, cells that are received and live.
         """
-        step = _step(record, telling, DITHER * self.full, 1e-5 * self.full)
-        noise = self.noise_of(record, above, drift, telling)
-        found = np.where(noise > _NOISIER * self.noise, np.maximum(self.near, noise), self.near)
-        if step <= max(2 * float(np.median(self.near)), _NOISIER * self.step):
+        step = _step(record, telling, 1e-5 * self.full)
+        moves = np.maximum(noise, _change(drift, record))
+        found = np.where(moves > _NOISIER * self.noise, np.maximum(self.near, moves), self.near)
+        if step <= max(NARROW * self.full, _NOISIER * self.step):
             step = 0.0
         return np.maximum(found, step).astype(np.float32), step
 
-    def noise_of(self, record: Record, above: Array, drift: Array, telling: Mask) -> Array:
-        """Return how far a cell reads from rest by noise, or as it drifts, ``[D]``; arguments as
-        for :meth:`unsure`."""
-        drift = drift[_blocks(record)]
-        later = _AROUND // 2
-        found: Array = np.abs(drift[later:] - drift[:-later]).max(axis=0, initial=0)
+    def noisier(self, noise: Array) -> Mask:
+        """Return the cells that read further from rest by ``noise`` ``[D]`` than in the reference,
+        bool ``[D]``."""
+        found: Mask = noise > np.maximum(self.near, _NOISIER * self.noise)
+        return found
+
+    def saturates(self, record: Record, above: Array, telling: Mask) -> bool:
+        """Return whether loads reach the top that did not in the reference; arguments as for
+        :meth:`noise_of`."""
+        return self.share_at_top(record, above, telling) > _SATURATES + _NOISIER * self.at_top
+
+    def share_at_top(self, record: Record, above: Array, telling: Mask) -> float:
+        """Return the share of the loaded readings of a usual cell that are at the top; arguments as
+        for :meth:`noise_of`."""
+        top = record.mean >= self.full * (1 - DITHER)
+        count = (top | (above > self.near)).sum(axis=0)
+        used = telling & (count > 0)
+        shares = top.sum(axis=0)[used] / count[used]
+        return float(np.median(shares)) if used.any() else 0.0
+
+    def noise_of(self, record: Record, above: Array, telling: Mask) -> Array:
+        """Return how far a cell reads from rest by noise, ``[D]``.
+
+        Args:
+            record: of the log.
+            above: readings above rest ``[n, D]``.
+            telling: bool ``[D]``, cells that are received and live.
+        """
+        found = np.zeros(above.shape[1], np.float32)
         follows = ~record.first[1:]
         if follows.sum() < _FEWEST:
             return found
@@ -220,17 +248,24 @@ class Rest:
         return found
 
 
-def _step(record: Record, telling: Mask, moves: float, same: float) -> float:
-    """Return the smallest difference between two readings of a usual cell that moves; 0 without
-    any."""
-    ranges = np.fmax.reduce(record.high) - np.fmin.reduce(record.low)
-    moving = telling & (ranges > moves)
-    if moving.sum() < _FEWEST:
-        return 0.0
-    read = np.sort(np.concatenate([record.low[:, moving], record.high[:, moving]]), axis=0)
+def _change(drift: Array, record: Record) -> Array:
+    """Return by how much each cell drifts while its pad is told anew, ``[D]`` of ``[n, D]``."""
+    of_block = drift[_blocks(record)]
+    later = _AROUND // 2
+    found: Array = np.abs(of_block[later:] - of_block[:-later]).max(axis=0, initial=0)
+    return found
+
+
+def _step(record: Record, telling: Mask, same: float) -> float:
+    """Return the smallest difference between two readings of a usual cell, where so many readings
+    without steps would come much closer; 0: too few do. Readings as close as ``same`` are equal."""
+    read = np.sort(np.concatenate([record.low[:, telling], record.high[:, telling]]), axis=0)
     steps = np.diff(read, axis=0)
     smallest = np.where(steps > same, steps, np.inf).min(axis=0)
-    return float(np.median(smallest))
+    moved = (read > read[0] + smallest / 2).sum(axis=0)
+    closest = (read[-1] - read[0]) / np.maximum(moved, 1) ** 2
+    sure = np.isfinite(smallest) & (smallest > _APART * closest)
+    return float(np.median(smallest[sure])) if sure.sum() >= _FEWEST else 0.0
 
 
 def fit_rest(record: Record, full: float, step: float, pad: Cells, living: Mask) -> Rest:
@@ -259,10 +294,12 @@ def fit_rest(record: Record, full: float, step: float, pad: Cells, living: Mask)
         near = np.fmax(least, 2 * np.fmax(noise, unsteady)).astype(np.float32)
         rest = Rest(level, near, full, high, pad, share, none, most, most, step)
     shared = rest.shared(record, living)
-    noise = rest.noise_of(record, rest.above(record, shared.offset), shared.drift, living)
+    above = rest.above(record, shared.offset)
+    noise = np.maximum(rest.noise_of(record, above, living), _change(shared.drift, record))
+    at_top = rest.share_at_top(record, above, living)
     offsets = np.maximum(near, _usually(rest.of_pads(record, living)))
     drifts = _usually(replace(rest, drifts=none).drift(record, living))
-    return replace(rest, noise=noise, offsets=offsets, drifts=drifts)
+    return replace(rest, noise=noise, offsets=offsets, drifts=drifts, at_top=at_top)
 
 
 def _usually(values: Array) -> Array:

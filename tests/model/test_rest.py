@@ -1,6 +1,7 @@
 """How cells rest, and what a pad shares."""
 
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -32,7 +33,8 @@ def above_rest(rest: Rest, record: Record, living: np.ndarray) -> np.ndarray:
 def width_of_rest(rest: Rest, record: Record, living: np.ndarray) -> tuple[np.ndarray, float]:
     """How far a cell reads from rest without a load, ``[D]``, and the step of its converter."""
     shared = rest.shared(record, living)
-    return rest.unsure(record, rest.above(record, shared.offset), shared.drift, living)
+    noise = rest.noise_of(record, rest.above(record, shared.offset), living)
+    return rest.unsure(record, noise, shared.drift, living)
 
 
 @given(st.lists(st.floats(-1e3, 1e3), min_size=2, max_size=30))
@@ -163,3 +165,16 @@ def test_a_coarser_converter_and_a_noisier_pad_widen_what_counts_as_rest(step):
     noisy = record_of([frames + rng.normal(0, step, frames.shape) for frames in log], 8)
     unsure, _ = width_of_rest(rest, noisy, living)
     assert (unsure > step / 2).all()
+
+
+@given(st.floats(1, 20))
+def test_a_step_is_told_from_readings_that_are_few(step):
+    rng = np.random.default_rng(0)
+    living = np.ones(24, bool)
+    rest = rest_of_reference(living)
+    few = [100 + rng.uniform(0, 800, (8, 24)) for _ in range(3)]
+    assert width_of_rest(rest, record_of(few, 8), living)[1] == 0
+    many = [100 + rng.uniform(0, 800, (48, 24)) for _ in range(40)]
+    coarse = record_of([np.floor(frames / step) * step for frames in many], 1)
+    found = width_of_rest(rest, coarse, living)[1]
+    assert found == (pytest.approx(step, rel=1e-3) if step > 2 else 0)

@@ -244,20 +244,23 @@ def _again_possible(again: NDArray[np.bool_], layout: SensorLayout) -> list[Faul
 def _weak_possible(
     little: NDArray[np.bool_], share: NDArray[np.float64], layout: SensorLayout
 ) -> list[Fault]:
-    """Return a possible fault for each cell (bool ``[D]``) that reads a ``share`` (``[D]``) of what
-    the cells on both sides read."""
+    """Return a possible fault for the cells of each pad (bool ``[D]``) that read a ``share``
+    (``[D]``) of what the cells on both sides read."""
     faults = []
-    for cell in np.flatnonzero(little).tolist():
+    for pad in np.unique(layout.pad_of[little]):
+        cells = np.flatnonzero(little & (layout.pad_of == pad)).tolist()
+        places = [f"{layout.place(cell)} ({share[cell]:.2f})" for cell in cells[:_LISTED]]
+        more = f" and {len(cells) - _LISTED} more" if len(cells) > _LISTED else ""
+        reads = "reads" if len(cells) == 1 else "read"
         reason = (
-            f"{layout.place(cell)} reads about {share[cell]:.2g} of what the cells on both sides of"
-            " it read, in nearly every contact: perhaps worn; not tested, as no reference tells"
-            " what is usual"
+            f"{'; '.join(places)}{more} {reads} this share of what the cells on both sides read, in"
+            " nearly every contact: perhaps worn; not tested, as no reference tells what is usual"
         )
         faults.append(
             Fault(
                 FaultKind.WEAK,
-                (cell,),
-                value=float(share[cell]),
+                cells,
+                value=float(np.median(share[cells])),
                 probability=MAJORITY,
                 reason=reason,
             )

@@ -33,7 +33,8 @@ Floats = NDArray[np.float64]
 
 
 def shares_of_load(spans: Spans, layout: SensorLayout) -> Floats:
-    """Return the median share of the load that suspect cells read, 0 to 1, ``[D]``; NaN: none.
+    """Return the median range of suspect cells over the mean of their neighbours', ``[D]``; NaN: of
+    the others.
 
     Args:
         spans: of n recordings.
@@ -50,10 +51,12 @@ def shares_of_load(spans: Spans, layout: SensorLayout) -> Floats:
     for one, other in zip(layout.beside.T[:pairs], layout.beside.T[::-1], strict=False):
         between = np.flatnonzero((one >= 0) & (other >= 0) & present)
         lesser = np.minimum(ranges[:, one[between]], ranges[:, other[between]])
+        mean = (ranges[:, one[between]] + ranges[:, other[between]]) / 2
         told = (lesser > light) & spans.known[:, between]
-        share = np.where(told, ranges[:, between] / np.maximum(lesser, light), np.nan)
-        most = known_quantile(share, 1 - LOW, axis=0)
+        of_lesser = np.where(told, ranges[:, between] / np.maximum(lesser, light), np.nan)
+        of_mean = np.where(told, ranges[:, between] / np.maximum(mean, light), np.nan)
+        most = known_quantile(of_lesser, 1 - LOW, axis=0)
         suspect = (told.sum(axis=0) >= FEWEST) & (most < MAJORITY)
-        usual = known_quantile(share, MAJORITY, axis=0)
+        usual = known_quantile(of_mean, MAJORITY, axis=0)
         found[between] = np.fmin(found[between], np.where(suspect, usual, np.nan))
     return found

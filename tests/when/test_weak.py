@@ -1,6 +1,7 @@
 """A cell that reads little of what the cells on both sides of it read is told, whoever is asked."""
 
 import json
+import re
 
 import numpy as np
 import pytest
@@ -90,6 +91,14 @@ def test_a_worn_cell_is_perhaps_weak_in_a_cold_start_and_a_person_is_told(n):
     healthy = af.inspect(contacts(1, n), SelfDiagnosis(LAYOUT))
     assert not healthy.diagnosis.possible
     assert healthy.severity == 0
+
+
+def test_cells_of_a_pad_are_told_in_one_sentence_each_with_its_share():
+    recordings = with_gain(with_gain(contacts(1), [WORN], 0.1), [11], 0.2)
+    (weak,) = SelfDiagnosis(LAYOUT).diagnose(recordings).possible
+    assert weak.cells == (WORN, 11)
+    shares = [float(number) for number in re.findall(r"column \d \(([0-9.]+)\)", weak.reason)]
+    assert shares == pytest.approx([0.1, 0.2], abs=0.05)
 
 
 def test_what_a_reference_shows_as_usual_is_not_told():

@@ -47,6 +47,7 @@ from diagnostics.layout import SensorLayout
 from diagnostics.model import Model, fit_model
 from diagnostics.model.findings import findings, shown
 from diagnostics.model.objects import judged_with_objects
+from diagnostics.model.symbols import NOTHING
 from diagnostics.preprocessing.array_likes import plain_array
 from diagnostics.preprocessing.copies import find_copies
 from diagnostics.preprocessing.levels import (
@@ -629,14 +630,19 @@ class SelfDiagnosis:
 
     def _by_model(self, model: Model, stream: StreamState) -> _Judged:
         """Return what the model says of the log behind a ``stream``."""
-        aliases, _ = find_aliasing(stream)
-        judgement, still = judged_with_objects(model, stream.record(), self._planes)
-        found = findings(judgement, stream, self.layout.full_scale, self.false_discovery_rate)
+        record = stream.record()
+        log = model.log_of_record(record)
+        aliases, _ = find_aliasing(stream, partial(model.log_likelihood, log))
         # what a pad shares looks alike on lines that nothing touches
-        doubtful = (found.probability >= DOUBTED)[self._place]
-        aliases = [fault for fault in aliases if doubtful[list(fault.cells)].any()]
+        loaded = (log.load > NOTHING).any(axis=0) & ~log.disturbed
         # lines of one cell each: which of the two is the copy is told by the model
-        aliases = [fault for fault in aliases if len(fault.cells) > 2]
+        aliases = [
+            fault for fault in aliases if loaded[list(fault.cells)].any() and len(fault.cells) > 2
+        ]
+        misread = np.zeros(len(loaded), bool)
+        misread[[cell for fault in aliases for cell in fault.cells]] = True
+        judgement, still = judged_with_objects(model, record, self._planes, misread)
+        found = findings(judgement, stream, self.layout.full_scale, self.false_discovery_rate)
         evidence = {
             "spatial": found.weight,
             "temporal": np.zeros(len(found.weight)),
@@ -646,7 +652,7 @@ class SelfDiagnosis:
             found=found,
             aliases=aliases,
             still=still,
-            shown=shown(judgement),
+            shown=shown(judgement) & stream.touched & model.living,
             contradicting=float(judgement.disturbed[model.present].mean()),
             evidence=evidence,
             pulled=partial(model.lines.pulled, judgement.observed),
@@ -654,7 +660,7 @@ class SelfDiagnosis:
 
     def _by_events(self, stream: StreamState, life: Life | None) -> _Judged:
         """Return what contact events and the proof of life say; arguments as in evaluate."""
-        aliases, copies = find_aliasing(stream)
+        aliases, copies = find_aliasing(stream, stream.log_likelihood)
         explained = copies
         still = list[StaticLoad]()
         tests_lines = life is None
@@ -758,7 +764,7 @@ class SelfDiagnosis:
         """Return whether cells depend on each other as healthy ones do."""
         stream = stream.complete()
         with one_thread():
-            _, copies = find_aliasing(stream)
+            _, copies = find_aliasing(stream, stream.log_likelihood)
             return self._proof(stream, copies)
 
     def _proof(self, stream: StreamState, explained: NDArray[np.bool_]) -> Life:

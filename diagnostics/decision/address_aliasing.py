@@ -9,7 +9,7 @@ levels are reported. Lines that nothing loads are not detected here.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -25,11 +25,21 @@ if TYPE_CHECKING:
     from diagnostics.evidence.stream_state import StreamState
 
 Cells = NDArray[np.intp]
+LogLikelihood = Callable[[int, NDArray[np.bool_]], tuple[NDArray[np.floating], NDArray[np.bool_]]]
 
 
-def find_aliasing(stream: StreamState) -> tuple[list[Fault], NDArray[np.bool_]]:
+def find_aliasing(
+    stream: StreamState, log_likelihood: LogLikelihood
+) -> tuple[list[Fault], NDArray[np.bool_]]:
     """Return the causes of all lines that read the same, and the cells that are or may be misread,
-    bool ``[D]``."""
+    bool ``[D]``.
+
+    Args:
+        stream: the log.
+        log_likelihood: of a frame and known cells (bool ``[D]``): mean log likelihood of what each
+            cell did since this frame, given the known ones, and whether it was loaded, ``[D]``
+            each.
+    """
     pairs = stream.duplicates.duplicate_pairs(stream.reference.duplicates.most)
     if stream.crosstalk is not None:  # lines that nothing touches read the same
         pairs = []
@@ -37,14 +47,16 @@ def find_aliasing(stream: StreamState) -> tuple[list[Fault], NDArray[np.bool_]]:
     misread = np.zeros(stream.layout.n_cells, bool)
     for of in sorted({(pair.pad, pair.kind) for pair in pairs}):
         for fault, cells in _on_pad(
-            [pair for pair in pairs if (pair.pad, pair.kind) == of], stream
+            [pair for pair in pairs if (pair.pad, pair.kind) == of], stream, log_likelihood
         ):
             faults.append(fault)
             misread[cells] = True
     return faults, misread
 
 
-def _on_pad(pairs: list[DuplicatePair], stream: StreamState) -> Iterator[tuple[Fault, Cells]]:
+def _on_pad(
+    pairs: list[DuplicatePair], stream: StreamState, log_likelihood: LogLikelihood
+) -> Iterator[tuple[Fault, Cells]]:
     """Yield the causes of pairs of rows, or of columns, of one pad, each with the cells that it may
     misread."""
     layout = stream.layout
@@ -73,6 +85,7 @@ def _on_pad(pairs: list[DuplicatePair], stream: StreamState) -> Iterator[tuple[F
             by_bit,
             onset,
             stream,
+            log_likelihood,
         )
     for pair in pairs:
         line = Line(pad, kind, pair.first)
@@ -88,12 +101,16 @@ def _on_pad(pairs: list[DuplicatePair], stream: StreamState) -> Iterator[tuple[F
 
 
 def _stuck_bit(
-    line: Line, pairs: list[DuplicatePair], onset: int, stream: StreamState
+    line: Line,
+    pairs: list[DuplicatePair],
+    onset: int,
+    stream: StreamState,
+    log_likelihood: LogLikelihood,
 ) -> tuple[Fault, Cells]:
     """Return the fault of an address bit, and the cells that it may misread: at either level if
     that is in doubt."""
     layout = stream.layout
-    ratio = _level_ratio(line, onset, stream)
+    ratio = _level_ratio(line, onset, stream, log_likelihood)
     level = int(ratio > 0)
     cells, sources = layout.misaddressed(line, level)
     across, name = (1, "row") if line.kind == "row_address" else (2, "column")
@@ -144,7 +161,9 @@ def _fault(
     )
 
 
-def _level_ratio(line: Line, onset: int, stream: StreamState) -> float:
+def _level_ratio(
+    line: Line, onset: int, stream: StreamState, log_likelihood: LogLikelihood
+) -> float:
     """Return the log ratio of a bit stuck at 1 against stuck at 0.
 
     Each level leaves other lines intact; the ratio compares their pseudo-likelihoods under the
@@ -158,14 +177,9 @@ def _level_ratio(line: Line, onset: int, stream: StreamState) -> float:
         empty = wrong[sources < 0]
         predictors = stream.present.copy()
         predictors[wrong] = False
-        loaded = False
-        for features, cells, modelled, model in stream.views(onset):
-            scored = modelled[np.isin(cells[modelled], intact)]
-            if len(scored):
-                likely = model(features, predictors[cells]).log_likelihood(features)
-                ratio += sign * float(likely[:, scored].mean(axis=0).sum())
-            loaded |= bool((features[:, 2, np.isin(cells, empty)] > 0).any())
+        likely, loaded = log_likelihood(onset, predictors)
+        ratio += sign * float(likely[intact].sum())
         # An address without a line never reads a load.
-        if loaded:
+        if loaded[empty].any():
             ratio -= sign * CERTAIN_RATIO
     return ratio

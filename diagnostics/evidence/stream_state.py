@@ -358,17 +358,21 @@ class StreamState:
         """The lowest reading of each cell so far, ``[D]``; inf: none."""
         return self.reference.scale.baseline + self._offsets.lowest
 
-    def views(self, onset: int) -> Iterator[tuple[Array, Cells, Cells, Model]]:
-        """Yield, for each tile, its events since frame ``onset`` as features ``[n, 4, k]``.
-
-        With them the k cells, the places among these of the cells that the model predicts, and the
-        model.
-        """
+    def log_likelihood(self, onset: int, known: Mask) -> tuple[NDArray[np.float64], Mask]:
+        """Return the mean log likelihood of what each cell did in the contact events since frame
+        ``onset``, given the ``known`` cells (bool ``[D]``), and whether it was loaded, ``[D]``
+        each."""
+        likely = np.zeros(self.layout.n_cells)
+        loaded = np.zeros(self.layout.n_cells, bool)
         for i, events in self.local.kept():
             tile = self.local.tiles[i]
             suffixes = [s.features() for e in events.kept for s in e.suffixes() if s.first >= onset]
             if suffixes:
-                yield np.stack(suffixes), tile.inputs, tile.place, self.model_of(i, events)
+                features = np.stack(suffixes)
+                expected = self.model_of(i, events)(features, known[tile.inputs])
+                likely[tile.outputs] = expected.log_likelihood(features).mean(axis=0)[tile.place]
+                loaded[tile.inputs] |= (features[:, 2] > 0).any(axis=0)
+        return likely, loaded
 
     def record(self) -> Record:
         """Return the record of the log so far, which the model judges.

@@ -11,12 +11,12 @@ from diagnostics.evidence.stream_state import StreamState
 from diagnostics.faults import FaultKind
 from diagnostics.model.judge import HELD, Judgement
 from diagnostics.model.record import Mask
-from diagnostics.model.ways import WAYS
+from diagnostics.model.ways import DRIFTS, WAYS
 from diagnostics.model.ways.comes_and_goes import COMES_AND_GOES
-from diagnostics.preprocessing.levels import DOUBTED, RARE
+from diagnostics.preprocessing.levels import CERTAIN_RATIO, DOUBTED, RARE
 
 _SHOWN = 1.0  # evidence that excludes a way to fail, or suggests one
-_NO_READING = (FaultKind.LATE, FaultKind.COPY)  # but frames, or a cell
+_NO_READING = (FaultKind.LATE, FaultKind.COPY, FaultKind.WEAK)  # but frames, a cell, a gain
 
 Floats = NDArray[np.float64]
 
@@ -40,6 +40,10 @@ def findings(
     delivers = log.received & ~silent
     probability = np.where(delivers, judgement.probability, np.where(silent, 1.0, 0.0))
     faulty = np.asarray(faulty_at(np.where(silent, 0.0, probability), rate) & delivers)
+    # dead in the reference already, and has not moved since
+    known = delivers & (stream.reference.dead > 0) & ~stream.runs.moved
+    probability[known] = stream.reference.dead[known]
+    faulty |= known
     frames = stream.intermittency
     blinks = frames.intermittent & delivers
     noisy = frames.excess & delivers
@@ -62,11 +66,14 @@ def findings(
     faulty = faulty | silent | by_frames | on_line
     way = np.where(on_line, WAYS.index(COMES_AND_GOES), judgement.way)
     kind = _kinds()[way]
-    refuted = np.where(faulty & ~silent & ~by_frames, kind, -1)
+    refuted = np.where(faulty & ~silent & ~by_frames & ~known, kind, -1)
     value = log.value.astype(np.float64)
     # what never left its rest agrees with a broken line, whatever is likeliest of it
-    holds = delivers & (faulty | (log.run >= HELD)) & (refuted < 0) & ~by_frames
-    rests = holds & (np.abs(value - rest.level) <= rest.near + log.symbols.tolerance)
+    drifts = faulty & ~silent & ~by_frames & ~known & (way == WAYS.index(DRIFTS))
+    holds = delivers & (faulty | (log.run >= HELD)) & (refuted < 0) & ~by_frames & ~drifts
+    # where a cell rests that was dead already, the reference does not show
+    level = np.where(stream.reference.dead > 0, stream.reference.scale.baseline, rest.level)
+    rests = holds & (np.abs(value - level) <= rest.near + log.symbols.tolerance)
     reading = stream.reading(value)
     beyond = holds & ~rests
     top = full_scale - log.symbols.tolerance
@@ -74,8 +81,10 @@ def findings(
     comes_and_goes = (kind >= 0) & (kind < len(OF_WIRES))
     likely = (judgement.evidence.max(axis=0) > 0) & ~shown(judgement)
     unsure = delivers & log.far & ~faulty & comes_and_goes & likely & ~disturbed
-    zero = np.zeros_like(present)
-    nothing = np.full(len(present), np.nan)
+    told = _value(judgement, np.where(refuted >= 0, way, -1), stream, reading)
+    weak = refuted == REFUTED_KINDS.index(FaultKind.WEAK)
+    gain = np.where(weak, told, np.nan)
+    reads_more = gain > 1
     return CellFindings(
         faulty=faulty,
         alive=delivers & log.far & ~faulty & (probability < DOUBTED),
@@ -85,25 +94,21 @@ def findings(
         zero=None if stream.load is None else beyond & (reading <= log.symbols.tolerance),
         intermittent=blinks,
         noisy=noisy,
-        drifting=zero,
-        gain=nothing,
-        value=np.where(
-            blinks,
-            stream.reading(_blinks_to(stream, full_scale)),
-            _value(judgement, np.where(refuted >= 0, way, -1), stream, reading),
-        ),
+        drifting=reads_more | drifts,
+        gain=gain,
+        value=np.where(blinks, stream.reading(_blinks_to(stream, full_scale)), told),
         since=np.select(
             [silent, blinks, noisy],
             [stream.runs.missed_since, frames.blinks_since, frames.noisy_since],
             _since(judgement, way, on_line),
         ),
         probability=probability,
-        weight=_weight(judgement, holds),
+        weight=np.where(known, CERTAIN_RATIO, _weight(judgement, holds)),
         events=np.select(
             [blinks, on_line], [frames.blinks, failing.units], len(judgement.units.begins)
         ),
-        known=stream.reference.dead > 0,
-        refuted=refuted,
+        known=known,
+        refuted=np.where(reads_more, -1, refuted),
         unsure=np.where(unsure, kind, -1),
         wire=np.where(on_line, failing.line, -1),
         of_wire=failing.probability,
@@ -130,9 +135,9 @@ def _weight(judgement: Judgement, holds: Mask) -> Floats:
 
 
 def _kinds() -> NDArray[np.intp]:
-    """Return the number of the kind of each way; -1: it holds a value."""
-    numbers = {kind: i for i, kind in enumerate(REFUTED_KINDS)}
-    return np.array([-1 if way.kind is None else numbers[way.kind] for way in WAYS])
+    """Return the number of the kind of each way; -1: it holds a value, or drifts."""
+    numbers: dict[FaultKind | None, int] = {kind: i for i, kind in enumerate(REFUTED_KINDS)}
+    return np.array([numbers.get(way.kind, -1) for way in WAYS])
 
 
 def _value(

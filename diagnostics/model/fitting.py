@@ -56,6 +56,7 @@ _RARELY = 1e-3
 _OFTEN = 0.2
 _SHORTEST = 24  # frames of a recording that is taken apart
 _LOGS = 32
+_OF_LOGS = 0.4  # of the time of a fit, for the progress only
 _LENGTHS = (3, 6, 6, 6, 6, 6, 6, 40)  # recordings of a log
 _SHORT = 6  # of a short one
 _DEAD = (0.0, 0.04, 0.08, 0.16)  # shares of the cells that are dead in it
@@ -167,14 +168,13 @@ def fit_model(
     observed = model.observed(log, living & log.received)
     model.odd = _odd(observed, living)
     model.lines = replace(model.lines, odd=_odd_lines(model.lines, observed))
-    progress(0.6)
-    _judge_logs(model, reference, held_out, rng)
+    progress(1 - _OF_LOGS)
+    _judge_logs(model, reference, held_out, rng, progress)
     model.lines = replace(model.lines, resting=lines.resting, half=NO_HALF)
     model.groups = replace(model.groups, chain=groups.chain, half=NO_HALF)
     predictor.mean = whole
     predictor.network = network
     model.flatness = flatness
-    progress(1.0)
     return model
 
 
@@ -287,7 +287,11 @@ def _odd_lines(lines: Lines, observed: Observed) -> Array:
 
 
 def _judge_logs(
-    model: Model, reference: _Reference, held_out: _HeldOut, rng: np.random.Generator
+    model: Model,
+    reference: _Reference,
+    held_out: _HeldOut,
+    rng: np.random.Generator,
+    progress: Callable[[float], None],
 ) -> None:
     """Let a model know the evidence of each way that healthy cells reach, lines and groups with
     them, in logs that are held out, with dead cells beside."""
@@ -322,6 +326,7 @@ def _judge_logs(
         every[long].append(evidence[:, healthy])
         units[long] = max(units[long], len(record.units))
         pieces = max(pieces, len(record))
+        progress(1 - _OF_LOGS * (1 - (i + 1) / _LOGS))
     for of_length, logs in zip(highest, every, strict=True):
         if logs:
             tail = np.quantile(np.concatenate(logs, axis=1), 1 - _EXCEED / len(cells), axis=1)

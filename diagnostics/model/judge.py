@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import expit, logit, logsumexp
 
+from diagnostics.faults import FaultKind
 from diagnostics.model.as_one import AsOne
 from diagnostics.model.groups import Groups
 from diagnostics.model.lines import Failing, Lines
@@ -171,6 +172,20 @@ class Model:
         """Return what the ``known`` cells say of a log."""
         return Observed(log, known, self.predictor, self.flatness)
 
+    def log_likelihood(self, log: Log, onset: int, known: Mask) -> tuple[Array, Mask]:
+        """Return the mean log likelihood of what each cell shows in the loaded pieces of a log
+        since frame ``onset``, given the ``known`` cells (bool ``[D]``), and whether it was loaded,
+        ``[D]`` each."""
+        since = log.record.begins >= onset
+        loaded: Mask = (log.load > NOTHING) & since[:, None]
+        ever = np.asarray(loaded.any(axis=0))
+        on = (loaded & known).any(axis=1)
+        if not on.any():
+            return np.zeros(len(known), np.float32), ever
+        observed = self.observed(log, known & log.received)
+        likely: Array = observed.of_level[on].mean(axis=0)
+        return likely, ever
+
     def judge_record(self, record: Record, explained: Mask | None = None) -> Judgement:
         """Judge a record, with pieces of this model's length; ``explained`` cells (bool ``[D]``;
         None: none) tell what their pad shares, no more."""
@@ -187,12 +202,13 @@ class Model:
         if (failing.cells & ~of_groups.cells).any():
             observed = self._by_trusted(log, failing.cells)
         units = replace(Units.of(observed, self.odd), goes=_GOES)
-        evidence = np.stack([way.evidence(observed, units) for way in WAYS])
-        evidence = self._certain(evidence, units)
-        # what never moved, here or in the reference, and rests: nothing is known of it
-        judged = log.received & (self.living | (log.level[-1] > 0)) & ~log.overloaded
+        of_ways = np.stack([way.evidence(observed, units) for way in WAYS])
+        evidence = self._certain(of_ways, units)
+        # of what never moved in the reference only a value that it holds away from rest tells
+        holds = (log.level[-1] > 0) & (log.run >= HELD)
+        judged = log.received & (self.living | holds) & ~log.overloaded
         disturbed = log.disturbed
-        counts = _counting(evidence, WAYS, disturbed)
+        counts = _counting(evidence, WAYS, disturbed | ~self.living)
         log_odds = logit(_PREVALENCE) + _of_any(counts, WAYS)
         if self._odd_as_a_whole(observed, log_odds > 0, log.far & ~failing.cells):
             disturbed = np.ones_like(disturbed)
@@ -202,7 +218,10 @@ class Model:
             evidence=evidence,
             log_odds=log_odds,
             probability=np.where(judged, _with_prevalence(log_odds, judged), 0.0),
-            way=_likeliest(counts),
+            # limits say who is faulty, not of what
+            way=_likeliest(
+                _counting(of_ways, WAYS, disturbed | ~self.living), log.run == len(record)
+            ),
             known=observed.known,
             observed=observed,
             units=units,
@@ -332,14 +351,19 @@ def _of_any(evidence: Array, ways: Sequence[Way]) -> Array:
     return found
 
 
-def _likeliest(evidence: Array) -> Cells:
-    """Return the way of each cell, int ``[D]``: that it holds a value, which tells more, where that
-    explains most of what any way does."""
-    best: Cells = evidence.argmax(axis=0)
-    holds = [i for i, way in enumerate(WAYS) if way.kind is None]
-    held = evidence[holds]
-    explains = held.max(axis=0) > _EXPLAINS * evidence.max(axis=0)
-    return np.where(explains, np.array(holds)[held.argmax(axis=0)], best)
+def _likeliest(evidence: Array, still: Mask) -> Cells:
+    """Return the way of each cell, int ``[D]``: the one that tells most of those that explain most
+    of what any way does. A value that is held tells more than another way, floating less; a cell
+    that is ``still`` (bool ``[D]``) all along holds one."""
+    found: Cells = evidence.argmax(axis=0)
+    explains = evidence > _EXPLAINS * evidence.max(axis=0)
+    held = [i for i, way in enumerate(WAYS) if way.kind is None]
+    told = [i for i, way in enumerate(WAYS) if way.kind not in (None, FaultKind.FLOATING)]
+    explains[held] |= still
+    for chosen in (told, held):
+        best = np.where(explains[chosen], evidence[chosen], -np.inf)
+        found = np.where(explains[chosen].any(axis=0), np.array(chosen)[best.argmax(axis=0)], found)
+    return found
 
 
 def _with_prevalence(log_odds: Floats, judged: Mask) -> Floats:

@@ -35,7 +35,7 @@ from diagnostics.layout import SensorLayout
 from diagnostics.model.judge import HELD, Judgement, Model
 from diagnostics.model.observed import Log
 from diagnostics.model.record import Array, Cells, Mask, Record
-from diagnostics.model.symbols import AT_REST, CONSTANT, root_load
+from diagnostics.model.symbols import AT_REST, CONSTANT, NOTHING, root_load
 from diagnostics.preprocessing.levels import ANYWHERE, EXPECTED
 
 _FEWEST = 3  # cells of an object
@@ -51,12 +51,12 @@ Floats = NDArray[np.float64]
 
 
 def judged_with_objects(
-    model: Model, record: Record, layout: SensorLayout
+    model: Model, record: Record, layout: SensorLayout, explained: Mask | None = None
 ) -> tuple[Judgement, list[StaticLoad]]:
     """Return the judgement of a record without the cells of the objects that lie still, and
-    these."""
+    these; ``explained`` cells (bool ``[D]``; None: none) are left out."""
     found: list[StaticLoad] = []
-    judgement = model.judge_record(record)
+    judgement = model.judge_record(record, explained)
     if not (judgement.probability > _BLAMED).any():  # an object has to explain a fault
         return judgement, found
     log = judgement.observed.log
@@ -67,7 +67,8 @@ def judged_with_objects(
         if under.sum() <= _cells_of(found, layout).sum():
             break
         found = more
-        judgement = model.judge_record(held.without(log, under, model), under)
+        out = under if explained is None else under | explained
+        judgement = model.judge_record(held.without(log, under, model), out)
     return judgement, found
 
 
@@ -101,6 +102,9 @@ def find_objects(
     """
     blamed = (judgement.probability > _BLAMED) | _cells_of(known, layout)
     holds = (held.load > 0) & ~_of_wires(held.load, blamed, layout, log.symbols.tolerance)
+    touched = log.load[:, judgement.known & ~holds] > NOTHING
+    if not touched.any():  # all that is loaded may be one contact
+        return []
     near = blamed
     if known:
         near = layout.with_neighbours(blamed)

@@ -20,6 +20,7 @@ from diagnostics.model.symbols import (
     root_load,
 )
 
+_STAYS = 0.05  # of a root load, or of those of a pad: a smaller change is none
 _ODD = 5.0  # nats of a unit beyond those expected
 _LOOKS = np.log([[0.95, 0.03, 0.02], [0.1, 0.88, 0.02]])  # of a held value without and with dither
 _USUALLY = 8.0  # cells that the usual look of a piece is worth
@@ -43,7 +44,7 @@ class Log:
         level, flat, before: int ``[n, D]``.
         agree: log P(two readings of this level agree) ``[n, D]``.
         either: int8 ``[shifts, n, D]``, levels that a reading may have: near an edge, either.
-        value: ``[D]``, reading at the end.
+        value: ``[D]``, reading at the end, of the pieces that agree with the last one.
         holds: bool ``[n, D]``, pieces at this value.
         run: int ``[D]``, of them, up to the end.
     """
@@ -77,9 +78,12 @@ class Log:
         self.agree = np.log(symbols.agree(self.step))[self.level]
         self.flat = symbols.flat(record)
         self.before = before_of(self.flat, record)
-        self.value = (record.low[-1] + record.high[-1]) / 2
-        low = self.value - symbols.tolerance
-        high = self.value + symbols.tolerance
+        self.value = _held(record.mean, DITHER * rest.full)
+        # beyond the range of the reference every reading is the top
+        top = rest.full - symbols.tolerance
+        saturates = self.value >= top
+        low = np.where(saturates, top, self.value - symbols.tolerance)
+        high = np.where(saturates, np.inf, self.value + symbols.tolerance)
         self.holds = (record.low >= low) & (record.high <= high)
         self._alone: Array | None = None
         ends_at_top = self.level[-1] == symbols.top
@@ -109,11 +113,29 @@ class Log:
         return found
 
 
+def _held(mean: Array, dither: float) -> Array:
+    """Return the value that each cell holds at the end, ``[D]``: the mean of its last pieces
+    ``[n, D]`` that differ from the last one by no more than a dither."""
+    from_end = np.flip(mean, 0)
+    alike = np.logical_and.accumulate(np.abs(from_end - mean[-1]) <= dither, 0)
+    count = np.maximum(alike.sum(axis=0), 1)
+    found: Array = (np.where(alike, from_end, 0).sum(axis=0) / count).astype(np.float32)
+    return np.where(alike[0], found, np.float32(np.nan))
+
+
+def _same(load: Array) -> Mask:
+    """Return where loads ``[n, D]`` are those of a piece ago."""
+    before = np.roll(load, 1, axis=0)
+    found: Mask = np.abs(load - before) <= _STAYS * np.maximum(load, before)
+    return found
+
+
 class Observed:
     """What the ``known`` cells, bool ``[D]``, say of a log.
 
     Attributes:
         levels: P(level) ``[n, D, K]``.
+        unwitnessed: where nobody tells of a contact, bool ``[n, D]``.
         of_level: log P(observed level) ``[n, D]``.
         of_flatness: log P(observed flatness | level, how many others move) ``[n, D]``.
         alone: log P(observed level) ``[n, D]`` by the past of the cell, nobody else.
@@ -126,7 +148,8 @@ class Observed:
         self.predictor = predictor
         self.flatness = flatness
         self.levels = predictor(log.load, log.load, log.record.first, known)
-        self.of_level = np.where(self._unwitnessed(), 0, log.likelihood(self.levels))
+        self.unwitnessed = self._unwitnessed()
+        self.of_level = np.where(self.unwitnessed, 0, log.likelihood(self.levels))
         self.group = log.symbols.group(log.level)
         activity = activity_of(log.level, log.flat, known)
         self.alike = self._alike()
@@ -185,8 +208,22 @@ class Observed:
             tells &= log.level > 0
         if log.saturated:
             tells &= log.level != log.symbols.top
+        tells &= ~self.stays | (log.level == 0)
         found: Array = np.where(tells, ratio, 0).astype(np.float32)
         return found
+
+    @cached_property
+    def tells(self) -> Mask:
+        """Where a reading tells a fault from none, bool ``[n, D]``."""
+        return self.log.record.received & ~self.stays
+
+    @cached_property
+    def stays(self) -> Mask:
+        """Where a cell stays while the load that known cells of its pad report stays, bool
+        ``[n, D]``: so does a healthy one."""
+        load = self.log.load
+        of_pad = self.predictor.on_pad(np.where(self.known, load, 0).astype(np.float32))
+        return _same(of_pad) & _same(load) & ~self.log.record.first[:, None]
 
     def delayed(self, lag: int) -> Array:
         """Return log P(observed level) ``[n, D]`` by what the others said ``lag`` pieces ago; by

@@ -28,12 +28,14 @@ from numpy.lib.stride_tricks import sliding_window_view
 from scipy.ndimage import median_filter
 
 from diagnostics.model.record import Array, Cells, Mask, Record, since_begin
+from diagnostics.preprocessing.quantiles import known_quantile
 
 NARROW = 0.002  # of full scale: readings differ by it without a load
 DITHER = 0.01  # of full scale: a stuck value with the dither of its converter
 _FEWEST = 6  # cells of a pad that tell what it shares
 _EVEN = 0.5  # of a negative offset: by which the cells that share it differ
 _NOISES = 3.0  # by which those that share a positive one differ; a contact may be even, too
+_SETTLES = 0.75  # of the recordings
 _RESTS = 0.25  # share of the recordings in which a cell rests at some time, at least
 _WIDER = 8.0  # than their interval is the spread of all, where these rest and others do not
 _LASTS = 0.25  # share of the pieces in which a pad has drifted, at least
@@ -43,11 +45,12 @@ _MOST = 2.0  # share of the offset of a pad that a cell shows in a log; in the r
 _BLOCK = 64  # pieces of a recording that are looked at as one
 _AROUND = 7  # blocks that tell where a cell rests, at least
 _MEDIAN = 5  # of them, those that tell where its pad does
-_QUIET = 0.3  # quantile of the changes between two pieces: a cell that no load moves
-_OF_DEVIATION = 0.545  # this quantile of a normal deviate's changes
+_QUIET = 0.1  # quantile of the changes between two pieces: a cell that no load moves
+_OF_DEVIATION = 0.178  # this quantile of a normal deviate's changes
 _USUALLY = 0.95  # of the pieces
 _NOISIER = 2.0  # times as noisy, or coarse, as the reference
 _UNSEEN = 1.5  # times what the reference usually shows: it never saw as much
+_FEWEST_STEPS = 3  # between the readings of a cell that has steps
 _APART = 10.0  # times what n readings of a range are apart at least, range / n^2: by steps
 _SATURATES = 0.1  # of the loaded readings of a usual cell are at the top
 _WITHIN = 4.0  # standard deviations
@@ -83,6 +86,7 @@ class Rest:
         noise: ``[D]``, how far each cell reads from rest in the reference by noise.
         offsets: ``[D]``, offset of its pad that few pieces of the reference exceed.
         drifts: ``[D]``, by how much it rests higher or lower in parts of the reference.
+        settles: bool ``[D]``, cells that come to rest in nearly all recordings of the reference.
         step: of the converter.
         at_top: share of the loaded readings of a usual cell that are at the top.
     """
@@ -96,6 +100,7 @@ class Rest:
     noise: Array
     offsets: Array
     drifts: Array
+    settles: Mask
     step: float = 0.0
     at_top: float = 0.0
 
@@ -141,7 +146,8 @@ class Rest:
         pad do, each by an amount of its own, ``[n, D]``.
 
         That is what the lowest readings of most of the recordings around agree on: a contact
-        differs from recording to recording.
+        differs from recording to recording. Cells that contacts often do not leave alone in one
+        tell nothing.
         """
         found = np.zeros(record.mean.shape, np.float32)
         first = _blocks(record)
@@ -151,7 +157,7 @@ class Rest:
         of_block = np.zeros_like(lowest)
         for pad in np.unique(self.pad).tolist():
             cells = np.flatnonzero((self.pad == pad) & np.isfinite(lowest).all(axis=0))
-            tell = telling[cells]
+            tell = (telling & self.settles)[cells]
             if tell.sum() < _FEWEST:
                 continue
             low = lowest[:, cells]
@@ -223,7 +229,7 @@ class Rest:
         for :meth:`noise_of`."""
         top = record.mean >= self.full * (1 - DITHER)
         count = (top | (above > self.near)).sum(axis=0)
-        used = telling & (count > 0)
+        used = telling & (count > 0) & ~top[-1]  # at the end, it may be stuck there
         shares = top.sum(axis=0)[used] / count[used]
         return float(np.median(shares)) if used.any() else 0.0
 
@@ -264,7 +270,8 @@ def _step(record: Record, telling: Mask, same: float) -> float:
     smallest = np.where(steps > same, steps, np.inf).min(axis=0)
     moved = (read > read[0] + smallest / 2).sum(axis=0)
     closest = (read[-1] - read[0]) / np.maximum(moved, 1) ** 2
-    sure = np.isfinite(smallest) & (smallest > _APART * closest)
+    # a cell that rests, and is then stuck, reads two values
+    sure = ((steps > same).sum(axis=0) >= _FEWEST_STEPS) & (smallest > _APART * closest)
     return float(np.median(smallest[sure])) if sure.sum() >= _FEWEST else 0.0
 
 
@@ -279,7 +286,8 @@ def fit_rest(record: Record, full: float, step: float, pad: Cells, living: Mask)
     share = np.ones_like(level)
     none = np.zeros_like(level)
     most = np.full_like(level, np.inf)
-    rest = Rest(level, near, full, high, pad, share, none, most, most, step)
+    every = np.ones(len(level), bool)
+    rest = Rest(level, near, full, high, pad, share, none, most, most, every, step)
     for _ in range(_ROUNDS):
         of_pads = rest.of_pads(record, living)
         usual = np.ones_like(share)
@@ -289,10 +297,13 @@ def fit_rest(record: Record, full: float, step: float, pad: Cells, living: Mask)
         level, spread = _lowest(without, first, least)
         range_ = record.high - record.low
         resting = np.where(without <= level + 2 * spread, range_, np.nan)
-        noise = np.nan_to_num(np.nanmedian(resting, axis=0))
+        noise = np.nan_to_num(known_quantile(resting, 0.5, axis=0)).astype(np.float32)
         unsteady = np.minimum(spread, _UNSTEADY * full)
         near = np.fmax(least, 2 * np.fmax(noise, unsteady)).astype(np.float32)
-        rest = Rest(level, near, full, high, pad, share, none, most, most, step)
+        rest = Rest(level, near, full, high, pad, share, none, most, most, every, step)
+    lowest = np.fmin.reduceat(without, first, axis=0)
+    settles = (lowest <= level + near).mean(axis=0) >= _SETTLES
+    rest = replace(rest, settles=settles)
     shared = rest.shared(record, living)
     above = rest.above(record, shared.offset)
     noise = np.maximum(rest.noise_of(record, above, living), _change(shared.drift, record))
@@ -332,15 +343,21 @@ def _lowest(readings: Array, first: Cells, least: float) -> tuple[Array, Array]:
     """Return the usual lowest reading of a recording and how it differs between them, ``[D]`` each;
     ``first``: first pieces; ``least``: readings this close are the same.
 
-    Where some recordings agree much better than all do, the others begin and end in a contact.
+    Where some recordings agree much better than all do, the others begin and end in a contact: a
+    quarter of them anywhere, or the lowest tenth.
     """
     lowest = np.fmin.reduceat(readings, first, axis=0)
     middle, width = shortest(lowest.T, _RESTS)
-    low, usual, median = np.nan_to_num(np.nanquantile(lowest, [0.1, 0.25, 0.5], axis=0))
+    bottom = known_quantile(lowest, 0.0, axis=0)
+    low = np.nan_to_num(known_quantile(lowest, 0.1, axis=0))
+    usual = np.nan_to_num(known_quantile(lowest, 0.25, axis=0))
+    median = np.nan_to_num(known_quantile(lowest, 0.5, axis=0))
     spread = median - low
-    agree = _WIDER * np.maximum(width, least) < spread
-    level = np.where(agree, middle, usual).astype(np.float32)
-    return level, np.where(agree, _WIDER * width, spread).astype(np.float32)
+    some = _WIDER * np.maximum(width, least) < spread
+    few = ~some & (_WIDER * np.maximum(low - bottom, least) < spread)
+    level = np.select([some, few], [middle, (low + bottom) / 2], usual).astype(np.float32)
+    of_few = np.nan_to_num(2 * (low - bottom))
+    return level, np.select([some, few], [_WIDER * width, of_few], spread).astype(np.float32)
 
 
 def _even(above: Array, share: float, noise: float, most: float) -> Array:

@@ -40,7 +40,8 @@ def state_after(log: np.ndarray) -> StreamState:
 
 
 def caused(log: np.ndarray) -> list[Fault]:
-    return find_aliasing(state_after(log))[0]
+    stream = state_after(log)
+    return find_aliasing(stream, stream.log_likelihood)[0]
 
 
 def duplicate_pairs(log: np.ndarray) -> list[DuplicatePair]:

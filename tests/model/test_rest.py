@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from diagnostics import SensorLayout
 from diagnostics.model.record import Record, record_of
-from diagnostics.model.rest import Rest, fit_rest, shortest
+from diagnostics.model.rest import Rest, _step, fit_rest, shortest
 from diagnostics.preprocessing.tolerance import converter_step
 
 PAD = np.repeat([0, 1], 12)
@@ -178,3 +178,13 @@ def test_a_step_is_told_from_readings_that_are_few(step):
     coarse = record_of([np.floor(frames / step) * step for frames in many], 1)
     found = width_of_rest(rest, coarse, living)[1]
     assert found == (pytest.approx(step, rel=1e-3) if step > 2 else 0)
+
+
+def test_cells_that_rest_and_are_then_stuck_are_no_steps_of_a_coarse_converter():
+    readings = np.random.default_rng(0).uniform(0, 4000, (400, 30))
+    readings[:200, :10] = 100.0
+    readings[200:, :10] = np.linspace(900, 3000, 10)
+    every = np.ones(30, bool)
+    assert _step(record_of([readings], 8), every, 0.04) == 0
+    coarse = 256 * np.floor(readings / 256)
+    assert _step(record_of([coarse], 8), every, 0.04) == 256

@@ -37,7 +37,7 @@ def _evidence(observed: Observed, units: Units) -> Array:
     much_more = np.take_along_axis(at_least, level + _NEAR, 2)[..., 0]
     near = np.log(np.maximum(more - much_more, np.exp(observed.of_level)))
     ratio = np.where(at, np.log(more) - near, 0)
-    return throughout(ratio * log.record.received, units)
+    return throughout(ratio * observed.tells, units)
 
 
 CLAMPED = Way(FaultKind.CLAMPED, 0.05, _evidence, value=_limit, decides=False)

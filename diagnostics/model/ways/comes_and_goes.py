@@ -22,7 +22,7 @@ def _evidence(observed: Observed, units: Units) -> Array:
     quiet = (log.level == 0) & (log.flat != MOVES)
     away = np.log(1 - MISS) - observed.of_level
     ratio = np.where(quiet, away, np.log(MISS))
-    return now_and_then(ratio * log.record.received, units)
+    return now_and_then(ratio * observed.tells, units)
 
 
 def _rest(observed: Observed) -> Array:

@@ -32,7 +32,7 @@ def _of(observed: Observed, units: Units, source: Array, given: Array) -> Array:
     loaded = (log.level > 0) | (source - rest.level > rest.near)
     same = np.log(1 - MISS) - log.agree - observed.of_level
     ratio = np.where(away <= log.symbols.tolerance, same, np.log(MISS))
-    told = loaded & log.record.received & np.isfinite(source)
+    told = loaded & observed.tells & np.isfinite(source)
     evidence = throughout(np.where(told, ratio, 0), units)
     # one of the two is the copy: what makes the other one it is as if this one were healthy
     expected = np.where(told, given - observed.of_level, 0).sum(axis=0)

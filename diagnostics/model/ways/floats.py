@@ -36,7 +36,7 @@ def _ratio(observed: Observed) -> Array:
     of_flatness = np.where(rests, 0, observed.of_flatness)
     either = np.logaddexp(np.log(own), observed.alone + of_flatness) - np.log(2)
     found: Array = either - observed.of_level - of_flatness
-    return found * log.record.received
+    return found * observed.tells
 
 
 def _evidence(observed: Observed, units: Units) -> Array:

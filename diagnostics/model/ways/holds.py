@@ -28,8 +28,9 @@ def _ratio(observed: Observed, *, dithers: bool) -> Array:
     matches = log.holds & (log.flat != MOVES)
     holds = np.log(1 - MISS) - log.agree - observed.of_level
     ratio = np.where(matches, holds, np.log(MISS))
-    found: Array = ratio + _CONSTANT * observed.constancy(dithers=dithers)
-    return found * log.record.received
+    constancy = observed.constancy(dithers=dithers) * log.record.received
+    found: Array = ratio * observed.tells + _CONSTANT * constancy
+    return found
 
 
 def _evidence(observed: Observed, units: Units, *, dithers: bool) -> Array:

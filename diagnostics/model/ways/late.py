@@ -18,7 +18,7 @@ from diagnostics.model.ways.way import Way
 
 def _evidence(observed: Observed, units: Units, *, lag: int) -> Array:
     ratio = observed.delayed(lag) - observed.of_level
-    return throughout(ratio * observed.log.record.received, units)
+    return throughout(ratio * observed.tells, units)
 
 
 def _value(observed: Observed, *, lag: int) -> Array:

@@ -1,0 +1,58 @@
+"""Follows the others, but no longer comes to rest where it did: an offset that came, or creeps.
+
+What is left of its readings above the lowest ones around gives its levels; these are compared with
+what the others say. Such a cell moves by itself as well: there is no more evidence than of that.
+
+Not detected: an offset below what counts as no load; one that all cells of the pad share.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.ndimage import minimum_filter1d
+
+from diagnostics.faults import FaultKind
+from diagnostics.model.observed import Observed
+from diagnostics.model.over_time import Units, for_good, since
+from diagnostics.model.record import Array, Cells
+from diagnostics.model.symbols import root_load
+from diagnostics.model.ways.floats import FLOATS
+from diagnostics.model.ways.way import Way
+
+_AROUND = 24  # pieces: in so many a cell comes to rest
+
+
+def _offset(observed: Observed) -> Array:
+    """Return how far above its rest each cell reads at least around each piece, ``[n, D]``."""
+    lowest = minimum_filter1d(observed.log.above, _AROUND, axis=0, mode="nearest")
+    found: Array = np.maximum(lowest, 0)
+    return found
+
+
+def _ratio(observed: Observed) -> Array:
+    log = observed.log
+    symbols = log.symbols
+    offset = _offset(observed)
+    without = log.above - offset
+    own = root_load(without, symbols.rest)
+    levels = observed.predictor(log.load, own, log.record.first, observed.known)
+    level = symbols.levels(log.record, without).astype(np.intp)
+    likely = np.log(np.take_along_axis(levels, level[..., None], 2)[..., 0])
+    moved = offset > symbols.rest.near
+    ratio = np.where(moved & ~observed.unwitnessed, likely - observed.of_level, 0)
+    found: Array = ratio * observed.tells
+    return found
+
+
+def _evidence(observed: Observed, units: Units) -> Array:
+    floats = FLOATS.evidence(observed, units)
+    if (floats <= 0).all():
+        return floats
+    return np.minimum(for_good(_ratio(observed), units), floats)
+
+
+def _since(observed: Observed, units: Units) -> Cells:
+    return since(_ratio(observed), units)
+
+
+DRIFTS = Way(FaultKind.DRIFT, 0.05, _evidence, _since, decides=False)

@@ -630,8 +630,7 @@ class SelfDiagnosis:
 
     def _by_model(self, model: Model, stream: StreamState) -> _Judged:
         """Return what the model says of the log behind a ``stream``."""
-        record = stream.record()
-        log = model.log_of_record(record)
+        log = model.log_of_record(stream.record())
         aliases, _ = find_aliasing(stream, partial(model.log_likelihood, log))
         # what a pad shares looks alike on lines that nothing touches
         loaded = (log.load > NOTHING).any(axis=0) & ~log.disturbed
@@ -641,7 +640,7 @@ class SelfDiagnosis:
         ]
         misread = np.zeros(len(loaded), bool)
         misread[[cell for fault in aliases for cell in fault.cells]] = True
-        judgement, still = judged_with_objects(model, record, self._planes, misread)
+        judgement, still = judged_with_objects(model, log, self._planes, misread)
         found = findings(judgement, stream, self.layout.full_scale, self.false_discovery_rate)
         evidence = {
             "spatial": found.weight,

@@ -220,11 +220,10 @@ def _again_possible(again: NDArray[np.bool_], layout: SensorLayout) -> list[Faul
         cells_of.setdefault(shown, []).append(cell)
     faults = []
     for shown, cells in cells_of.items():
-        places = [layout.place(cell) for cell in cells[:_LISTED]]
-        more = f" and {len(cells) - _LISTED} more" if len(cells) > _LISTED else ""
+        places = _listed([layout.place(cell) for cell in cells])
         hold = "holds" if len(cells) == 1 else "hold"
         reason = (
-            f"{'; '.join(places)}{more} {hold} the same value away from rest all through recordings"
+            f"{places} {hold} the same value away from rest all through recordings"
             f" {ranges(shown)}, while cells beside move: dead there, or something lies on them; not"
             " tested"
         )
@@ -249,11 +248,10 @@ def _weak_possible(
     faults = []
     for pad in np.unique(layout.pad_of[little]):
         cells = np.flatnonzero(little & (layout.pad_of == pad)).tolist()
-        places = [f"{layout.place(cell)} ({share[cell]:.2f})" for cell in cells[:_LISTED]]
-        more = f" and {len(cells) - _LISTED} more" if len(cells) > _LISTED else ""
+        places = _listed([f"{layout.place(cell)} ({share[cell]:.2f})" for cell in cells])
         reads = "reads" if len(cells) == 1 else "read"
         reason = (
-            f"{'; '.join(places)}{more} {reads} this share of what the cells on both sides read, in"
+            f"{places} {reads} this share of what the cells on both sides read, in"
             " nearly every contact: perhaps worn; not tested, as no reference tells what is usual"
         )
         faults.append(
@@ -266,6 +264,12 @@ def _weak_possible(
             )
         )
     return faults
+
+
+def _listed(places: Sequence[str]) -> str:
+    """Return the first places, and how many more there are."""
+    more = f" and {len(places) - _LISTED} more" if len(places) > _LISTED else ""
+    return f"{'; '.join(places[:_LISTED])}{more}"
 
 
 def _verdicts(

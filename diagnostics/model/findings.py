@@ -66,10 +66,11 @@ def findings(
     faulty = faulty | silent | by_frames | on_line
     way = np.where(on_line, WAYS.index(COMES_AND_GOES), judgement.way)
     kind = _kinds()[way]
-    refuted = np.where(faulty & ~silent & ~by_frames & ~known, kind, -1)
+    by_pieces = faulty & ~silent & ~by_frames & ~known
+    refuted = np.where(by_pieces, kind, -1)
     value = log.value.astype(np.float64)
     # what never left its rest agrees with a broken line, whatever is likeliest of it
-    drifts = faulty & ~silent & ~by_frames & ~known & (way == WAYS.index(DRIFTS))
+    drifts = by_pieces & (way == WAYS.index(DRIFTS))
     holds = delivers & (faulty | (log.run >= HELD)) & (refuted < 0) & ~by_frames & ~drifts
     # where a cell rests that was dead already, the reference does not show
     level = np.where(stream.reference.dead > 0, stream.reference.scale.baseline, rest.level)

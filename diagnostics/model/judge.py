@@ -187,9 +187,13 @@ class Model:
         return likely, ever
 
     def judge_record(self, record: Record, explained: Mask | None = None) -> Judgement:
-        """Judge a record, with pieces of this model's length; ``explained`` cells (bool ``[D]``;
-        None: none) tell what their pad shares, no more."""
-        log = self.log_of_record(record)
+        """Judge a record, with pieces of this model's length; ``explained``: as for
+        :meth:`judge_log`."""
+        return self.judge_log(self.log_of_record(record), explained)
+
+    def judge_log(self, log: Log, explained: Mask | None = None) -> Judgement:
+        """Judge a log, which is changed by it; ``explained`` cells (bool ``[D]``; None: none) tell
+        what their pad shares, no more."""
         if explained is not None:
             log.received &= ~explained
             log.far &= ~explained
@@ -208,20 +212,20 @@ class Model:
         holds = (log.level[-1] > 0) & (log.run >= HELD)
         judged = log.received & (self.living | holds) & ~log.overloaded
         disturbed = log.disturbed
-        counts = _counting(evidence, WAYS, disturbed | ~self.living)
+        only_held = disturbed | ~self.living
+        counts = _counting(evidence, WAYS, only_held)
         log_odds = logit(_PREVALENCE) + _of_any(counts, WAYS)
         if self._odd_as_a_whole(observed, log_odds > 0, log.far & ~failing.cells):
             disturbed = np.ones_like(disturbed)
-            counts = _counting(evidence, WAYS, disturbed)
+            only_held = disturbed
+            counts = _counting(evidence, WAYS, only_held)
             log_odds = logit(_PREVALENCE) + _of_any(counts, WAYS)
         return Judgement(
             evidence=evidence,
             log_odds=log_odds,
             probability=np.where(judged, _with_prevalence(log_odds, judged), 0.0),
             # limits say who is faulty, not of what
-            way=_likeliest(
-                _counting(of_ways, WAYS, disturbed | ~self.living), log.run == len(record)
-            ),
+            way=_likeliest(_counting(of_ways, WAYS, only_held), log.run == len(log.record)),
             known=observed.known,
             observed=observed,
             units=units,

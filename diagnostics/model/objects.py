@@ -51,15 +51,14 @@ Floats = NDArray[np.float64]
 
 
 def judged_with_objects(
-    model: Model, record: Record, layout: SensorLayout, explained: Mask | None = None
+    model: Model, log: Log, layout: SensorLayout, explained: Mask
 ) -> tuple[Judgement, list[StaticLoad]]:
-    """Return the judgement of a record without the cells of the objects that lie still, and
-    these; ``explained`` cells (bool ``[D]``; None: none) are left out."""
+    """Return the judgement of a log without the cells of the objects that lie still, and these;
+    ``explained`` cells (bool ``[D]``) are left out. The log is changed by it."""
     found: list[StaticLoad] = []
-    judgement = model.judge_record(record, explained)
+    judgement = model.judge_log(log, explained)
     if not (judgement.probability > _BLAMED).any():  # an object has to explain a fault
         return judgement, found
-    log = judgement.observed.log
     held = HeldLoads.of(log, model)
     for _ in range(_ROUNDS):
         more = find_objects(model, judgement, log, held, layout, found)
@@ -67,8 +66,7 @@ def judged_with_objects(
         if under.sum() <= _cells_of(found, layout).sum():
             break
         found = more
-        out = under if explained is None else under | explained
-        judgement = model.judge_record(held.without(log, under, model), out)
+        judgement = model.judge_record(held.without(log, under, model), under | explained)
     return judgement, found
 
 

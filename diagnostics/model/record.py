@@ -271,10 +271,6 @@ class Recorder:
         found[0] |= self.given is None
         return found
 
-    def __len__(self) -> int:
-        """Return the number of pieces so far."""
-        return sum(map(len, self.complete)) + (0 if self.last is None else len(self.last))
-
     def record(self, n_frames: int) -> Record:
         """Return the record of a log of ``n_frames`` that ends here.
 

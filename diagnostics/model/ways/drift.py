@@ -16,7 +16,7 @@ from diagnostics.model.observed import Observed
 from diagnostics.model.over_time import Units, for_good, since
 from diagnostics.model.record import Array, Cells
 from diagnostics.model.symbols import root_load
-from diagnostics.model.ways.floats import FLOATS
+from diagnostics.model.ways.floats import no_more_than_floats
 from diagnostics.model.ways.way import Way
 
 _AROUND = 24  # pieces: in so many a cell comes to rest
@@ -45,10 +45,7 @@ def _ratio(observed: Observed) -> Array:
 
 
 def _evidence(observed: Observed, units: Units) -> Array:
-    floats = FLOATS.evidence(observed, units)
-    if (floats <= 0).all():
-        return floats
-    return np.minimum(for_good(_ratio(observed), units), floats)
+    return no_more_than_floats(observed, units, lambda: for_good(_ratio(observed), units))
 
 
 def _since(observed: Observed, units: Units) -> Cells:

@@ -10,6 +10,8 @@ predict.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from diagnostics.faults import FaultKind
@@ -41,6 +43,15 @@ def _ratio(observed: Observed) -> Array:
 
 def _evidence(observed: Observed, units: Units) -> Array:
     return for_good(_ratio(observed), units)
+
+
+def no_more_than_floats(observed: Observed, units: Units, told: Callable[[], Array]) -> Array:
+    """Return the evidence ``[D]`` of a way to move by oneself that is ``told`` (asked where a cell
+    floats at all): no more than that the cell floats, of which it is one."""
+    floats = FLOATS.evidence(observed, units)
+    if (floats <= 0).all():
+        return floats
+    return np.minimum(told(), floats)
 
 
 def _since(observed: Observed, units: Units) -> Cells:

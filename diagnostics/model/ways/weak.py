@@ -16,10 +16,10 @@ from diagnostics.model.observed import Observed
 from diagnostics.model.over_time import Units, for_good, since
 from diagnostics.model.record import Array, Cells
 from diagnostics.model.symbols import Symbols
-from diagnostics.model.ways.floats import FLOATS
+from diagnostics.model.ways.floats import no_more_than_floats
 from diagnostics.model.ways.way import Way
 
-GAINS = np.array([1 / 32, 1 / 16, 1 / 8, 0.18, 0.25, 0.35, 0.5, 2, 2.8, 4], np.float32)
+_GAINS = np.array([1 / 32, 1 / 16, 1 / 8, 0.18, 0.25, 0.35, 0.5, 2, 2.8, 4], np.float32)
 _LOADED = 0.15  # root load that the others surely expect
 _LAST = 0.4  # of the pieces with such a load
 _FEWEST = 5
@@ -64,22 +64,22 @@ def _ratio(observed: Observed) -> Array:
     symbols = log.symbols
     near = float(np.median(symbols.rest.near) / symbols.rest.full)
     told = np.nan_to_num(gain_of(observed), nan=1.0)
-    distance = np.abs(np.log(np.maximum(told, GAINS[0] / 2))[:, None] - np.log(GAINS))
+    distance = np.abs(np.log(np.maximum(told, _GAINS[0] / 2))[:, None] - np.log(_GAINS))
     nearest = distance.argmin(axis=1)
-    own = _scaled(log.load, 1 / GAINS[nearest], near)
+    own = _scaled(log.load, 1 / _GAINS[nearest], near)
     usual = observed.predictor(log.load, own, log.record.first, observed.known)
-    each = np.stack([_levels(symbols, gain, near) for gain in GAINS.tolist()])
+    each = np.stack([_levels(symbols, gain, near) for gain in _GAINS.tolist()])
     levels = np.einsum("ndk,dkl->ndl", usual, each[nearest], optimize=True)
     ratio = log.likelihood(np.maximum(levels, usual.min())) - observed.of_level
     return np.where(observed.unwitnessed, 0, ratio) * observed.tells
 
 
 def _evidence(observed: Observed, units: Units) -> Array:
-    floats = FLOATS.evidence(observed, units)
-    if (floats <= 0).all():
-        return floats
-    found: Array = for_good(_ratio(observed), units) - np.log(len(GAINS))
-    return np.minimum(found, floats)
+    def told() -> Array:
+        found: Array = for_good(_ratio(observed), units) - np.log(len(_GAINS))
+        return found
+
+    return no_more_than_floats(observed, units, told)
 
 
 def _since(observed: Observed, units: Units) -> Cells:

@@ -631,9 +631,12 @@ class SelfDiagnosis:
     def _by_model(self, model: Model, stream: StreamState) -> _Judged:
         """Return what the model says of the log behind a ``stream``."""
         log = model.log_of_record(stream.record())
+        if stream.crosstalk is not None:
+            log.disturbed[:] = True
         aliases, _ = find_aliasing(stream, partial(model.log_likelihood, log))
         # what a pad shares looks alike on lines that nothing touches
-        loaded = (log.load > NOTHING).any(axis=0) & ~log.disturbed
+        touched = (log.load > NOTHING).any(axis=0)
+        loaded = touched & ~log.disturbed
         # lines of one cell each: which of the two is the copy is told by the model
         aliases = [
             fault for fault in aliases if loaded[list(fault.cells)].any() and len(fault.cells) > 2
@@ -642,6 +645,7 @@ class SelfDiagnosis:
         misread[[cell for fault in aliases for cell in fault.cells]] = True
         judgement, still = judged_with_objects(model, log, self._planes, misread)
         found = findings(judgement, stream, self.layout.full_scale, self.false_discovery_rate)
+        follows = shown(judgement) & (found.probability < DOUBTED)
         evidence = {
             "spatial": found.weight,
             "temporal": np.zeros(len(found.weight)),
@@ -651,7 +655,7 @@ class SelfDiagnosis:
             found=found,
             aliases=aliases,
             still=still,
-            shown=shown(judgement) & stream.touched & model.living,
+            shown=follows & touched & stream.touched & model.living,
             contradicting=float(judgement.disturbed[model.present].mean()),
             evidence=evidence,
             pulled=partial(model.lines.pulled, judgement.observed),
@@ -729,8 +733,11 @@ class SelfDiagnosis:
         # each other; nor is a line that a shorted crossing pulls.
         shown = judged.shown
         shorts = [f.cells[0] for f in causes if f.kind is FaultKind.SHORT and f.line is None]
+        # a cell that reads a part of its load may be pulled
+        misleads = inferred.copy()
+        misleads[[c for f in causes if f.kind is FaultKind.WEAK for c in f.cells]] = False
         if judged.pulled is not None and shorts:
-            pulled = judged.pulled(self._place[np.array(shorts)], inferred[self._order])
+            pulled = judged.pulled(self._place[np.array(shorts)], misleads[self._order])
             causes = pulling(causes, pulled[self._place], self.layout)
             shown = shown & ~pulled
         if self._of_log or self.reference_ is None:

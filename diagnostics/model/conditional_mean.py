@@ -9,10 +9,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg.lapack import dpotrf, dpotri
 
 from diagnostics.events.tiles import tiles
 from diagnostics.layout import SensorLayout
@@ -21,6 +23,7 @@ from diagnostics.model.record import Array, Cells, Mask
 _SURELY = 0.1  # root load that is surely one
 _CONSTANT = 1e-3  # standard deviation of an input that tells nothing
 _RIDGE = 1e-3
+_KEPT = 2  # inverses
 
 Floats = NDArray[np.float64]
 
@@ -115,10 +118,30 @@ class Tile:
 
     def _precision(self, two: Mask) -> Floats:
         """Return the inverse of the covariance of some inputs, bool ``[2 k]``."""
-        found: Floats = cho_solve(
-            cho_factor(self.covariance[np.ix_(two, two)]), np.eye(int(two.sum()))
-        )
+        key = two.tobytes()
+        found = self._inverses.get(key)
+        if found is None:
+            found = _inverse(self.covariance[np.ix_(two, two)])
+            while len(self._inverses) >= _KEPT:
+                self._inverses.pop(next(iter(self._inverses)))
+            self._inverses[key] = found
         return found
+
+    @cached_property
+    def _inverses(self) -> dict[bytes, Floats]:
+        """The last inverses: many questions are asked of the same cells."""
+        return {}
+
+
+def _inverse(covariance: Floats) -> Floats:
+    """Return the inverse of a positive definite matrix, by its Cholesky factor."""
+    factor, failed = dpotrf(covariance, lower=1)
+    if failed:
+        raise np.linalg.LinAlgError("a covariance is not positive definite")
+    half, _ = dpotri(factor, lower=1)
+    lower: Floats = np.tril(half)
+    lower += np.tril(half, -1).T
+    return lower
 
 
 def _left_out(y: Floats, precision: Floats) -> Floats:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import expit
 
 from diagnostics.decision.calibration import faulty_at
 from diagnostics.decision.root_causes import OF_WIRES, REFUTED_KINDS, CellFindings
@@ -74,7 +75,8 @@ def findings(
     holds = delivers & (faulty | (log.run >= HELD)) & (refuted < 0) & ~by_frames & ~drifts
     # where a cell rests that was dead already, the reference does not show
     level = np.where(stream.reference.dead > 0, stream.reference.scale.baseline, rest.level)
-    rests = holds & (np.abs(value - level) <= rest.near + log.symbols.tolerance)
+    # below its rest a cell is cut off as well
+    rests = holds & (value - level <= rest.near + log.symbols.tolerance)
     reading = stream.reading(value)
     beyond = holds & ~rests
     top = full_scale - log.symbols.tolerance
@@ -88,7 +90,8 @@ def findings(
     reads_more = gain > 1
     return CellFindings(
         faulty=faulty,
-        alive=delivers & log.far & ~faulty & (probability < DOUBTED),
+        # how many others are faulty makes no wire of those that move
+        alive=delivers & log.far & ~faulty & (expit(judgement.log_odds) < DOUBTED),
         silent=silent,
         rests=rests,
         full=beyond & (reading >= top),
@@ -132,7 +135,9 @@ def _weight(judgement: Judgement, holds: Mask) -> Floats:
     """Return the log ratio of each cell, faulty : healthy, ``[D]``; of one that ``holds`` a value
     (bool) by that alone."""
     of_holding = judgement.evidence[[way.kind is None for way in WAYS]].max(axis=0)
-    return np.where(holds, of_holding, judgement.log_odds).astype(np.float64)
+    weight = np.where(holds, of_holding, judgement.log_odds).astype(np.float64)
+    # where a cell rests that never moved in the reference tells nothing
+    return np.where(judgement.observed.log.living, weight, np.minimum(weight, 0.0))
 
 
 def _kinds() -> NDArray[np.intp]:

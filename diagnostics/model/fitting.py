@@ -55,9 +55,9 @@ _ODD_UNITS = 50.0  # units of all cells that weigh on the share of one
 _RARELY = 1e-3
 _OFTEN = 0.2
 _SHORTEST = 24  # frames of a recording that is taken apart
-_LOGS = 32
+_LOGS = 48
 _OF_LOGS = 0.4  # of the time of a fit, for the progress only
-_LENGTHS = (3, 6, 6, 6, 6, 6, 6, 40)  # recordings of a log
+_LENGTHS = (3, 6, 6, 40)  # recordings of a log
 _SHORT = 6  # of a short one
 _DEAD = (0.0, 0.04, 0.08, 0.16)  # shares of the cells that are dead in it
 _EXCEED = 0.1  # healthy cells of a log exceed the limit of all
@@ -123,6 +123,7 @@ def fit_model(
         None: too few frames, or no cell moves in them.
     """
     rng = np.random.default_rng(0)
+    longest = max(map(len, recordings))
     recordings = _enough([np.asarray(one, np.float32) for one in recordings])
     present = layout.present.ravel()
     full = float(layout.full_scale)
@@ -163,7 +164,7 @@ def fit_model(
     held_out = _held_out(reference, symbols, examples, resting, chain)
     progress(0.5)
     flatness = reference.flatness(symbols, np.ones(len(record), bool))
-    model = Model.of(symbols, flatness, predictor, length, present, living, lines, groups)
+    model = Model.of(symbols, flatness, predictor, length, longest, present, living, lines, groups)
     held_out.judge(model, reference.of_piece)
     observed = model.observed(log, living & log.received)
     model.odd = _odd(observed, living)
@@ -294,11 +295,14 @@ def _judge_logs(
     progress: Callable[[float], None],
 ) -> None:
     """Let a model know the evidence of each way that healthy cells reach, lines and groups with
-    them, in logs that are held out, with dead cells beside."""
+    them, in logs that are held out, with dead cells beside.
+
+    In the first half of the logs it is told who is healthy. What cells reach there bounds the
+    evidence in the others, in which it finds them by itself: without a bound, some healthy cell of
+    a long log always looks faulty, and misleads the others once it is left out.
+    """
     cells = np.flatnonzero(model.living)
-    highest = np.zeros((2, len(WAYS), len(model.present)), np.float32)
-    every: tuple[list[Array], list[Array]] = ([], [])
-    units = np.ones(2, np.intp)
+    reached = _Reached.of(model)
     of_lines = np.zeros(len(model.lines.on), np.float32)
     of_groups = np.zeros(len(model.groups.odd), np.float32)
     pieces = 1
@@ -314,27 +318,63 @@ def _judge_logs(
                 frames[:, cell] = value
         record = model.record_of(log)
         held_out.judge(model, reference.fold[chosen][record.recording])
-        judgement = model.judge_record(record)
-        evidence = judgement.evidence
+        healthy = model.living.copy()
+        healthy[dead] = False
+        told = 3 * i < 2 * _LOGS
+        if not told:
+            reached.bound(model)
+        judgement = model.judge_record(record, healthy=healthy if told else None)
         of_lines = np.maximum(of_lines, _of_healthy_lines(model, judgement, rng))
         moving = judgement.observed.log.far & model.living
         of_group, _ = model.groups.evidence(judgement.observed.log, moving)
         of_groups = np.maximum(of_groups, of_group)
-        healthy = np.setdiff1d(cells, dead)
-        long = int(size > _SHORT)
-        highest[long][:, healthy] = np.maximum(highest[long][:, healthy], evidence[:, healthy])
-        every[long].append(evidence[:, healthy])
-        units[long] = max(units[long], len(record.units))
+        reached.add(judgement, healthy, is_long=size > _SHORT)
         pieces = max(pieces, len(record))
         progress(1 - _OF_LOGS * (1 - (i + 1) / _LOGS))
-    for of_length, logs in zip(highest, every, strict=True):
-        if logs:
-            tail = np.quantile(np.concatenate(logs, axis=1), 1 - _EXCEED / len(cells), axis=1)
-            np.maximum(of_length, tail[:, None], out=of_length)
-    model.highest = np.maximum.accumulate(highest)
-    model.reached = np.maximum.accumulate(units)
-    model.lines = replace(model.lines, highest=of_lines, reached=int(units.max()))
+    reached.bound(model)
+    model.lines = replace(model.lines, highest=of_lines, reached=int(model.reached.max()))
     model.groups = replace(model.groups, highest=of_groups, reached=pieces)
+
+
+@dataclass(frozen=True)
+class _Reached:
+    """The evidence of each way that healthy cells reach.
+
+    Attributes:
+        highest: ``[2, ways, D]``, in short logs and in long ones.
+        every: evidence ``[ways, cells]`` of the healthy cells of each log, short and long ones.
+        units: int ``[2]``, most units of a log.
+    """
+
+    highest: Array
+    every: tuple[list[Array], list[Array]]
+    units: Cells
+
+    @classmethod
+    def of(cls, model: Model) -> _Reached:
+        """Return what they reach before any log."""
+        highest = np.zeros((2, len(WAYS), len(model.present)), np.float32)
+        return cls(highest, ([], []), np.ones(2, np.intp))
+
+    def add(self, judgement: Judgement, healthy: Mask, *, is_long: bool) -> None:
+        """Take in a log; ``healthy``: bool ``[D]``, who is."""
+        number = int(is_long)
+        evidence = judgement.of_ways[:, healthy]
+        before = self.highest[number][:, healthy]
+        self.highest[number][:, healthy] = np.maximum(before, evidence)
+        self.every[number].append(evidence)
+        self.units[number] = max(self.units[number], len(judgement.units.begins))
+
+    def bound(self, model: Model) -> None:
+        """Let a model know it: of each cell, and what one of ten logs exceeds of all."""
+        highest = self.highest.copy()
+        cells = int(model.living.sum())
+        for of_length, logs in zip(highest, self.every, strict=True):
+            if logs:
+                tail = np.quantile(np.concatenate(logs, axis=1), 1 - _EXCEED / cells, axis=1)
+                np.maximum(of_length, tail[:, None], out=of_length)
+        model.highest = np.maximum.accumulate(highest)
+        model.reached = np.maximum.accumulate(self.units)
 
 
 def _of_healthy_lines(model: Model, judgement: Judgement, rng: np.random.Generator) -> Array:

@@ -44,8 +44,9 @@ _ITERATIONS = 10
 _DECIDING = [i for i, way in enumerate(WAYS) if way.decides]
 _OTHERS = [i for i, way in enumerate(WAYS) if not way.decides]
 _EXPLAINS = 0.5  # of the evidence of any way: a value that is held
+_NEARLY_ALL = 0.9  # of it: what tells more than that a cell floats
 _DISTURBED = 1 / 3  # of the cells that move
-_FEWEST = 8  # cells that show a disturbance
+_FEWEST = 4  # cells that show a disturbance
 _MOST_CELLS = 0.75  # of those that are trusted: so many are less odd than
 _STRANGE = 10.0  # times as often as usual
 # of a log: what is kept of all cells, but no fewer pieces
@@ -60,7 +61,8 @@ class Judgement:
     """What a log says of each cell, ``[D]``.
 
     Attributes:
-        evidence: ``[ways, D]``, of each way to fail.
+        evidence: ``[ways, D]``, of each way to fail, within the limits of healthy cells.
+        of_ways: ``[ways, D]``, the same without limits.
         log_odds: float, faulty : healthy, with the usual prevalence.
         probability: float, P(faulty).
         way: int, number of the likeliest way.
@@ -73,6 +75,7 @@ class Judgement:
     """
 
     evidence: Array
+    of_ways: Array
     log_odds: Floats
     probability: Floats
     way: Cells
@@ -90,6 +93,7 @@ class Model:
     Attributes:
         symbols, flatness, predictor: of healthy cells.
         length: frames of a piece.
+        longest: frames of a recording of the reference, at most.
         present, living: bool ``[D]``, cells that there are, and that ever moved.
         odd: ``[D]``, share of the units in which each healthy cell is odd.
         highest: ``[2, ways, D]``, evidence of each way that a healthy cell reaches in a short log
@@ -102,6 +106,7 @@ class Model:
     flatness: Flatness
     predictor: Predictor
     length: int
+    longest: int
     present: Mask
     living: Mask
     odd: Array
@@ -117,6 +122,7 @@ class Model:
         flatness: Flatness,
         predictor: Predictor,
         length: int,
+        longest: int,
         present: Mask,
         living: Mask,
         lines: Lines,
@@ -131,6 +137,7 @@ class Model:
             flatness,
             predictor,
             length,
+            longest,
             present,
             living,
             odd,
@@ -143,7 +150,8 @@ class Model:
     def recorder(self) -> Recorder:
         """Return what builds the record of a log that goes on and on."""
         most = max(_FEWEST_PIECES, _MOST_READINGS / len(self.present))
-        return Recorder(self.length, DITHER * self.symbols.rest.full, most, self._as_one)
+        tolerance = DITHER * self.symbols.rest.full
+        return Recorder(self.length, tolerance, most, self._as_one, longest=self.longest)
 
     @property
     def _as_one(self) -> AsOne | None:
@@ -186,25 +194,34 @@ class Model:
         likely: Array = observed.of_level[on].mean(axis=0)
         return likely, ever
 
-    def judge_record(self, record: Record, explained: Mask | None = None) -> Judgement:
-        """Judge a record, with pieces of this model's length; ``explained``: as for
+    def judge_record(
+        self, record: Record, explained: Mask | None = None, healthy: Mask | None = None
+    ) -> Judgement:
+        """Judge a record, with pieces of this model's length; other arguments as for
         :meth:`judge_log`."""
-        return self.judge_log(self.log_of_record(record), explained)
+        return self.judge_log(self.log_of_record(record), explained, healthy)
 
-    def judge_log(self, log: Log, explained: Mask | None = None) -> Judgement:
-        """Judge a log, which is changed by it; ``explained`` cells (bool ``[D]``; None: none) tell
-        what their pad shares, no more."""
+    def judge_log(
+        self, log: Log, explained: Mask | None = None, healthy: Mask | None = None
+    ) -> Judgement:
+        """Judge a log, which is changed by it.
+
+        Args:
+            log: of any length.
+            explained: bool ``[D]``, cells that tell what their pad shares, no more; None: none.
+            healthy: bool ``[D]``, cells to be trusted; None: they are found.
+        """
         if explained is not None:
             log.received &= ~explained
             log.far &= ~explained
         of_groups = self._failing_groups(log)
         log.disturbed = self._disturbed(log, of_groups)
-        observed = self._by_trusted(log, of_groups.cells)
+        observed = self._by_trusted(log, of_groups.cells, healthy)
         moving = self.moving(log)
         telling = moving & ~self._by_itself(observed, moving) & ~log.disturbed
         failing = self.lines.failing(observed, moving, telling, of_groups)
         if (failing.cells & ~of_groups.cells).any():
-            observed = self._by_trusted(log, failing.cells)
+            observed = self._by_trusted(log, failing.cells, healthy)
         units = replace(Units.of(observed, self.odd), goes=_GOES)
         of_ways = np.stack([way.evidence(observed, units) for way in WAYS])
         evidence = self._certain(of_ways, units)
@@ -222,6 +239,7 @@ class Model:
             log_odds = logit(_PREVALENCE) + _of_any(counts, WAYS)
         return Judgement(
             evidence=evidence,
+            of_ways=of_ways,
             log_odds=log_odds,
             probability=np.where(judged, _with_prevalence(log_odds, judged), 0.0),
             # limits say who is faulty, not of what
@@ -278,9 +296,12 @@ class Model:
         each = _counting(every, ways, observed.log.disturbed)
         return _of_any(self._certain(each, units, chosen), ways), _of_any(each, ways)
 
-    def _by_trusted(self, log: Log, out: Mask) -> Observed:
+    def _by_trusted(self, log: Log, out: Mask, healthy: Mask | None) -> Observed:
         """Return what those say of a log who are trusted to predict the others; those that are
-        ``out`` (bool ``[D]``) are not. Ways to fail that take long are asked at the end."""
+        ``out`` (bool ``[D]``) are not. ``healthy``: those, where it is known. Ways to fail that
+        take long are asked at the end."""
+        if healthy is not None:
+            return self.observed(log, log.received & self.living & healthy & ~out)
         holds = (log.run >= HELD) & (log.load[-1] > NOTHING)
         stays = ~(log.received & self.living) | out
         observed = self.observed(log, self.moving(log) & ~out)
@@ -299,10 +320,11 @@ class Model:
                 stays |= joins
                 observed = self.observed(log, known | joins)
                 continue
-            evidence, _ = self._told(observed, units, _OTHERS)
+            evidence, of_all = self._told(observed, units, _OTHERS)
             suspect = known & (evidence > _SUSPECT)
             if not suspect.any():
                 break
+            suspect = self._worst(suspect, known, of_all)
             stays |= suspect
             observed = self.observed(log, known & ~suspect)
         return observed
@@ -360,10 +382,11 @@ def _likeliest(evidence: Array, still: Mask) -> Cells:
     of what any way does. A value that is held tells more than another way, floating less; a cell
     that is ``still`` (bool ``[D]``) all along holds one."""
     found: Cells = evidence.argmax(axis=0)
-    explains = evidence > _EXPLAINS * evidence.max(axis=0)
+    most = evidence.max(axis=0)
     held = [i for i, way in enumerate(WAYS) if way.kind is None]
     told = [i for i, way in enumerate(WAYS) if way.kind not in (None, FaultKind.FLOATING)]
-    explains[held] |= still
+    explains = evidence > _NEARLY_ALL * most
+    explains[held] = still | (evidence[held] > _EXPLAINS * most)
     for chosen in (told, held):
         best = np.where(explains[chosen], evidence[chosen], -np.inf)
         found = np.where(explains[chosen].any(axis=0), np.array(chosen)[best.argmax(axis=0)], found)

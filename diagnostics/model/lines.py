@@ -285,7 +285,7 @@ class Lines:
             faulty: bool ``[D]``, cells that tell nothing of their line.
         """
         load = observed.log.load
-        known = observed.known & ~faulty
+        known = observed.log.far & ~faulty
         crossing = self.on[:, shorted].any(axis=1)
         # those on the lines in question tell nothing of the others
         tells = known & ~self.on[crossing].any(axis=0)

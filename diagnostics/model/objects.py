@@ -161,6 +161,7 @@ class HeldLoads:
             last = n - HELD
         received = model.present & record.received.any(axis=0)
         lowest = np.minimum(_FLOOR, model.predictor.rests / 2)
+        top = rest.full - log.symbols.tolerance
         since = _since((log.above > rest.near) & received)
         load = np.zeros(len(received), np.float32)
         for cell in np.flatnonzero(since < last).tolist():
@@ -172,7 +173,7 @@ class HeldLoads:
             # what it may share with its pad beside what it is known to
             more = shared * (1 / max(rest.share[cell], _FLOOR) - 1)
             least = rest.near[cell] + max(more, -shared)
-            if floor > least and np.median(log.level[begin:, cell]) < log.symbols.top:
+            if floor > least and rest.level[cell] + floor < top:
                 load[cell] = floor
         since = _since((log.above > load / 2) & (load > 0))
         return cls(np.where(since < last, load, 0), since)

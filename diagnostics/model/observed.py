@@ -32,6 +32,7 @@ class Log:
 
     Attributes:
         record: its pieces.
+        living: bool ``[D]``, cells that ever moved in the reference.
         received: bool ``[D]``, cells that deliver readings.
         far: bool ``[D]``, those that move by more than a dither.
         above: readings above rest ``[n, D]``, without what the pad shares.
@@ -52,6 +53,7 @@ class Log:
     def __init__(self, record: Record, symbols: Symbols, present: Mask, living: Mask) -> None:
         self.record = record
         self.symbols = symbols
+        self.living = living
         rest = symbols.rest
         lowest = np.fmin.reduce(record.low)
         highest = np.fmax.reduce(record.high)
@@ -220,10 +222,12 @@ class Observed:
     @cached_property
     def stays(self) -> Mask:
         """Where a cell stays while the load that known cells of its pad report stays, bool
-        ``[n, D]``: so does a healthy one."""
-        load = self.log.load
-        of_pad = self.predictor.on_pad(np.where(self.known, load, 0).astype(np.float32))
-        return _same(of_pad) & _same(load) & ~self.log.record.first[:, None]
+        ``[n, D]``: so does a healthy one, but not below its rest nor at the top, where no load
+        that stays holds it."""
+        log = self.log
+        of_pad = self.predictor.on_pad(np.where(self.known, log.load, 0).astype(np.float32))
+        found = _same(of_pad) & _same(log.load) & ~log.record.first[:, None]
+        return found & (log.level < log.symbols.top)
 
     def delayed(self, lag: int) -> Array:
         """Return log P(observed level) ``[n, D]`` by what the others said ``lag`` pieces ago; by

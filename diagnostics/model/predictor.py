@@ -62,7 +62,7 @@ class Network:
         deviation = inputs.std(axis=0) + np.float32(1e-6)
         z = (inputs - mean) / deviation
         rng = np.random.default_rng(0)
-        steps = int(np.clip(_EPOCHS * len(z) / _BATCH, _FEWEST_STEPS, most * _STEPS))
+        steps = int(max(_FEWEST_STEPS, min(_EPOCHS * len(z) / _BATCH, most * _STEPS)))
         fit = MLPClassifier(_HIDDEN, learning_rate_init=_RATE, alpha=1e-6, random_state=0)
         fit.batch_size = min(_BATCH, len(z))
         rounds = -(-steps // _STEPS_OF_ROUND)

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from diagnostics.model.as_one import AsOne
@@ -24,6 +25,9 @@ UNIT = 8  # pieces of a unit
 _PIECES = 6  # of a short recording
 _FEWEST = 3
 _KEPT = 0.75  # of the pieces that there may be, once there are more
+_CUT = 5.0  # times the tolerance: a load that vanishes, or appears
+_CELLS = 0.05  # share of the cells that do, and as many that do the other; two at least
+_SUDDEN = 3.0  # times what changed in the frames before
 
 
 @dataclass(frozen=True)
@@ -35,6 +39,7 @@ class Record:
             those of the piece before.
         received: bool ``[n, D]``, whether anything was.
         recording: int ``[n]``, from 0.
+        first: bool ``[n]``, whether a recording begins with a piece: stated, or by a cut.
         begins: int ``[n]``, number of the first frame of each.
         n_frames: of the log.
         as_one: ``[n, G]``, share of the frames in which each group reads as one.
@@ -45,18 +50,13 @@ class Record:
     mean: Array
     received: Mask
     recording: Cells
+    first: Mask
     begins: Cells
     n_frames: int
     as_one: Array = field(default_factory=lambda: np.zeros((0, 0), np.float32))
 
     def __len__(self) -> int:
         return len(self.begins)
-
-    @cached_property
-    def first(self) -> Mask:
-        """Whether a recording begins with a piece, bool ``[n]``."""
-        found: Mask = np.diff(self.recording, prepend=-1) != 0
-        return found
 
     @cached_property
     def of_unit(self) -> Cells:
@@ -93,7 +93,7 @@ class _Pieces:
         low, high: lowest and highest reading ``[n, D]``; NaN: none was received.
         total, count: sum and number of the readings that were received, ``[n, D]``.
         frames: int ``[n]``, frames of each piece.
-        recording, begins: as of :class:`Record`.
+        recording, first, begins: as of :class:`Record`.
     """
 
     low: Array
@@ -102,6 +102,7 @@ class _Pieces:
     count: NDArray[np.int32]
     frames: Cells
     recording: Cells
+    first: Mask
     begins: Cells
 
     def __len__(self) -> int:
@@ -129,6 +130,7 @@ class _Pieces:
             np.add.reduceat(self.count, first, axis=0),
             np.add.reduceat(self.frames, first),
             self.recording[first],
+            self.first[first],
             self.begins[first],
         )
 
@@ -159,7 +161,7 @@ class _Pieces:
             high = np.take_along_axis(high, last, 0)
             mean = np.take_along_axis(mean, last, 0)
             mean[:, ~received.any(axis=0)] = np.nan
-        return Record(low, high, mean, received, self.recording, self.begins, n_frames)
+        return Record(low, high, mean, received, self.recording, self.first, self.begins, n_frames)
 
     def _of_cells(self, groups: int) -> _Pieces:
         """Return the pieces without the last columns."""
@@ -182,6 +184,10 @@ class Recorder:
     nothing, and is left out: loggers are faster than sensors. With more than ``most`` pieces,
     those in which nothing changes are dropped, then the oldest.
 
+    Recordings that were joined begin with a cut: in one frame loads vanish and others appear
+    elsewhere, and much more changes than in the frames before, as noise and contacts do not. It is
+    looked for once a recording is longer than those of the reference.
+
     Attributes:
         length: frames of a piece.
         tolerance: readings change by more.
@@ -191,6 +197,9 @@ class Recorder:
         last: the last two, which may.
         recordings: number of those that began.
         given: ``[D]``, the last frame; None: there was none.
+        changes: ``[length]``, how much changed in each of the last frames.
+        longest: frames of a recording of the reference, at most.
+        age: frames of the recording so far.
     """
 
     length: int
@@ -201,6 +210,14 @@ class Recorder:
     last: _Pieces | None = None
     recordings: int = 0
     given: NDArray[np.floating] | None = None
+    changes: Array = field(default_factory=lambda: np.zeros(0, np.float32))
+    longest: float = np.inf
+    age: int = 0
+
+    def __len__(self) -> int:
+        """Number of pieces."""
+        last = 0 if self.last is None else len(self.last)
+        return sum(map(len, self.complete)) + last
 
     def extend(
         self, frames: NDArray[np.floating], numbers: Cells, *, begins: Mask | None = None
@@ -217,12 +234,17 @@ class Recorder:
         if begins is None:
             begins = np.arange(len(frames)) == 0
         fresh = self._fresh(frames) | begins
-        given = frames[-1]
+        cut, changes = self._cuts(frames)
+        age = since_begin(begins) + np.where(begins.cumsum() == 0, self.age, 0)
+        cut &= age >= self.longest
+        age_after = int(age[-1]) + 1
+        given = frames[-1].copy()
         frames = frames[fresh]
         numbers = numbers[fresh]
         begins = begins[fresh]
         if not len(frames):
-            return self
+            return replace(self, changes=changes, age=age_after)
+        cut = cut[fresh] & ~begins
         if self.as_one is not None:
             frames = np.hstack([frames, self.as_one(frames)])
         open_frames = 0
@@ -230,16 +252,18 @@ class Recorder:
             begins = begins | (np.arange(len(frames)) == 0)
         else:
             open_frames = int(self.last.frames[-1])
+        opens = begins | cut
         # frames of the recording so far, up to a multiple of the length
-        since = since_begin(begins) + np.where(begins.cumsum() == 0, open_frames, 0)
+        since = since_begin(opens) + np.where(opens.cumsum() == 0, open_frames, 0)
         starts = since % self.length == 0
         first = np.flatnonzero(starts)
         continues = not starts[0]
         if continues:
             first = np.insert(first, 0, 0)
         new = _pieces(frames, numbers, first)
-        opens = begins[first]
-        new = replace(new, recording=self.recordings - 1 + np.cumsum(opens))
+        new = replace(
+            new, recording=self.recordings - 1 + np.cumsum(begins[first]), first=opens[first]
+        )
         run = new
         before = 0
         if self.last is not None:
@@ -248,15 +272,17 @@ class Recorder:
         joins = np.zeros(len(run), bool)
         joins[before] = continues
         run = run.merged(joins)
-        ended = np.diff(run.recording, append=run.recording[-1]) > 0
+        ended = np.append(run.first[1:], False)
         run = run.merged(self._too_short(run) & ended)
         kept = (*self.complete, run.chosen(slice(0, -2)))
         return replace(
             self,
             complete=self._fewer(kept),
             last=run.chosen(slice(-2, None)),
-            recordings=self.recordings + int(opens.sum()),
+            recordings=self.recordings + int(begins[first].sum()),
             given=given,
+            changes=changes,
+            age=age_after,
         )
 
     def _fresh(self, frames: NDArray[np.floating]) -> Mask:
@@ -270,6 +296,22 @@ class Recorder:
         found: Mask = ~same.all(axis=1) | missing.all(axis=1)
         found[0] |= self.given is None
         return found
+
+    def _cuts(self, frames: NDArray[np.floating]) -> tuple[Mask, Array]:
+        """Return the frames ``[t, D]`` with which joined recordings begin, bool ``[t]``, and how
+        much changed in the last frames."""
+        before = np.concatenate([frames[:1] if self.given is None else self.given[None], frames])
+        step = np.nan_to_num(np.diff(before, axis=0))
+        least = _CUT * self.tolerance
+        appear = (step > least).sum(axis=1)
+        vanish = (step < -least).sum(axis=1)
+        both = np.minimum(appear, vanish) >= max(2, _CELLS * frames.shape[1])
+        both &= self.tolerance > 0
+        changes = self.changes if len(self.changes) else np.zeros(self.length, np.float32)
+        change = np.concatenate([changes, np.abs(step).sum(axis=1).astype(np.float32)])
+        usual = sliding_window_view(change, self.length)[:-1].max(axis=1)
+        cuts: Mask = both & (change[self.length :] > _SUDDEN * usual)
+        return cuts, change[-self.length :]
 
     def record(self, n_frames: int) -> Record:
         """Return the record of a log of ``n_frames`` that ends here.
@@ -288,8 +330,7 @@ class Recorder:
     def _too_short(self, run: _Pieces) -> Mask:
         """Return the pieces of less than half a length behind another of the same recording, bool
         ``[n]``."""
-        follows = np.diff(run.recording, prepend=-1) == 0
-        found: Mask = follows & (2 * run.frames < self.length)
+        found: Mask = ~run.first & (2 * run.frames < self.length)
         return found
 
     def _fewer(self, complete: tuple[_Pieces, ...]) -> tuple[_Pieces, ...]:
@@ -309,11 +350,15 @@ def since_begin(begins: Mask) -> Cells:
 
 
 def record_of(
-    recordings: Sequence[NDArray[np.floating]], length: int, as_one: AsOne | None = None
+    recordings: Sequence[NDArray[np.floating]],
+    length: int,
+    as_one: AsOne | None = None,
+    tolerance: float = 0.0,
+    longest: float = np.inf,
 ) -> Record:
     """Return the record of recordings ``[T, D]`` each, with ``length`` frames a piece; NaN:
-    missing. ``as_one``: of :class:`Recorder`."""
-    recorder = Recorder(length, as_one=as_one)
+    missing. ``as_one``, ``tolerance``, ``longest``: of :class:`Recorder`."""
+    recorder = Recorder(length, tolerance, as_one=as_one, longest=longest)
     frame = 0
     for one in recordings:
         recorder = recorder.extend(one, frame + np.arange(len(one)))
@@ -333,6 +378,7 @@ def _pieces(frames: NDArray[np.floating], numbers: Cells, first: Cells) -> _Piec
         np.add.reduceat(~missing, first, axis=0, dtype=np.int32),
         np.diff(np.append(first, len(x))),
         np.zeros_like(first),
+        np.zeros(len(first), bool),
         numbers[first],
     )
 

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from diagnostics.model.record import UNIT, frames_of_piece, record_of
+from diagnostics.model.record import UNIT, Recorder, frames_of_piece, record_of
 
 LENGTHS = st.lists(st.integers(1, 40), min_size=1, max_size=5)
 
@@ -69,3 +69,46 @@ def test_frames_that_repeat_the_one_before_tell_nothing():
 @pytest.mark.parametrize(("frames", "length"), [(1, 1), (12, 2), (60, 8), (1000, 8)])
 def test_a_short_recording_has_some_pieces_too(frames, length):
     assert frames_of_piece([np.zeros((frames, 1))]) == length
+
+
+def joined(seed: int) -> np.ndarray:
+    """Two recordings of contacts elsewhere, one behind the other, ``[60, 20]``."""
+    rng = np.random.default_rng(seed)
+    frames = rng.normal(0, 1, (60, 20))
+    frames[:30, :6] += 100 * np.sin(np.linspace(0.3, 1.5, 30))[:, None]
+    frames[30:, 10:16] += 100 * np.sin(np.linspace(1.5, 0.3, 30))[:, None]
+    return frames
+
+
+def test_recordings_that_were_joined_begin_with_a_cut():
+    record = record_of([joined(0)], 8, tolerance=10.0, longest=30)
+    assert record.begins[record.first].tolist() == [0, 30]
+    assert set(record.recording) == {0}
+
+
+def test_a_recording_as_long_as_those_of_the_reference_has_no_cut():
+    record = record_of([joined(0)], 8, tolerance=10.0, longest=31)
+    assert record.begins[record.first].tolist() == [0]
+
+
+def test_noise_is_no_cut():
+    frames = joined(0) + 200 * np.random.default_rng(1).normal(size=(60, 20))
+    record = record_of([frames], 8, tolerance=10.0, longest=1)
+    assert record.first.sum() <= 2  # the first of all may be one
+
+
+@pytest.mark.parametrize("size", [1, 7, 20, 31])
+def test_a_record_is_the_same_however_the_frames_come_in_and_whoever_reuses_their_memory(size):
+    frames = joined(2)
+    whole = Recorder(4, 10.0, longest=30).extend(frames, np.arange(60)).record(60)
+    recorder = Recorder(4, 10.0, longest=30)
+    memory = np.empty((size, 20))
+    for begin in range(0, 60, size):
+        some = frames[begin : begin + size]
+        memory[: len(some)] = some
+        first = np.arange(begin, begin + len(some)) == 0
+        recorder = recorder.extend(memory[: len(some)], begin + np.arange(len(some)), begins=first)
+    parts = recorder.record(60)
+    np.testing.assert_array_equal(parts.begins, whole.begins)
+    np.testing.assert_array_equal(parts.first, whole.first)
+    np.testing.assert_allclose(parts.mean, whole.mean)

@@ -1,4 +1,4 @@
-"""Healthy up to a limit, and at it whatever the others say is more.
+"""Healthy up to a limit, and still at it whatever the others say is more.
 
 A load one level further up counts as at the limit: the loads of a healthy cell end somewhere, too.
 
@@ -13,6 +13,8 @@ from diagnostics.faults import FaultKind
 from diagnostics.model.observed import Observed
 from diagnostics.model.over_time import Units, throughout
 from diagnostics.model.record import Array
+from diagnostics.model.symbols import MOVES
+from diagnostics.model.ways.floats import no_more_than_floats
 from diagnostics.model.ways.way import Way
 
 _NEAR = 2  # levels that may end at the limit
@@ -37,7 +39,12 @@ def _evidence(observed: Observed, units: Units) -> Array:
     much_more = np.take_along_axis(at_least, level + _NEAR, 2)[..., 0]
     near = np.log(np.maximum(more - much_more, np.exp(observed.of_level)))
     ratio = np.where(at, np.log(more) - near, 0)
-    return throughout(ratio * observed.tells, units)
+    still = ratio + np.where(at & (log.flat != MOVES), -observed.of_flatness, 0)
+    # a healthy cell is still now and then, where it reads most
+    moves_by_itself = no_more_than_floats(
+        observed, units, lambda: throughout(still * observed.tells, units)
+    )
+    return np.maximum(throughout(ratio * observed.tells, units), moves_by_itself)
 
 
 CLAMPED = Way(FaultKind.CLAMPED, 0.05, _evidence, value=_limit, decides=False)

@@ -27,9 +27,10 @@ def _ratio(observed: Observed, *, dithers: bool) -> Array:
     log = observed.log
     matches = log.holds & (log.flat != MOVES)
     holds = np.log(1 - MISS) - log.agree - observed.of_level
-    ratio = np.where(matches, holds, np.log(MISS))
-    constancy = observed.constancy(dithers=dithers) * log.record.received
-    found: Array = ratio * observed.tells + _CONSTANT * constancy
+    # another value denies it, however still the pad is
+    ratio = np.where(matches, holds * observed.tells, np.log(MISS))
+    constancy = _CONSTANT * observed.constancy(dithers=dithers)
+    found: Array = (ratio + constancy) * log.record.received
     return found
 
 

@@ -16,7 +16,6 @@ from diagnostics.model.observed import Observed
 from diagnostics.model.over_time import Units, for_good, since
 from diagnostics.model.record import Array, Cells
 from diagnostics.model.symbols import Symbols
-from diagnostics.model.ways.floats import no_more_than_floats
 from diagnostics.model.ways.way import Way
 
 _GAINS = np.array([1 / 32, 1 / 16, 1 / 8, 0.18, 0.25, 0.35, 0.5, 2, 2.8, 4], np.float32)
@@ -75,11 +74,8 @@ def _ratio(observed: Observed) -> Array:
 
 
 def _evidence(observed: Observed, units: Units) -> Array:
-    def told() -> Array:
-        found: Array = for_good(_ratio(observed), units) - np.log(len(_GAINS))
-        return found
-
-    return no_more_than_floats(observed, units, told)
+    found: Array = for_good(_ratio(observed), units) - np.log(len(_GAINS))
+    return found
 
 
 def _since(observed: Observed, units: Units) -> Cells:

@@ -370,7 +370,7 @@ CODES: tuple[Code, ...] = (
         "Something lies still on the array: an object or a strap.",
         "Its load is in each reading of its cells.",
         "Its cells are not tested.",
-        method="diagnostics.model.objects",
+        method="diagnostics.decision.static_loads",
         needs="reference",
     ),
     Code(

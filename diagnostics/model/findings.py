@@ -2,24 +2,16 @@
 
 from __future__ import annotations
 
-from functools import partial
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import expit
 
-from diagnostics.decision.address_aliasing import find_aliasing
 from diagnostics.decision.calibration import faulty_at
-from diagnostics.decision.judged import Judged
 from diagnostics.decision.root_causes import OF_WIRES, REFUTED_KINDS, CellFindings
-from diagnostics.evidence.cold_start import typical_reading
 from diagnostics.evidence.stream_state import StreamState
 from diagnostics.faults import FaultKind
-from diagnostics.layout import SensorLayout
-from diagnostics.model.judge import HELD, Judgement, Model
-from diagnostics.model.objects import judged_with_objects
+from diagnostics.model.judge import HELD, Judgement
 from diagnostics.model.record import Mask
-from diagnostics.model.symbols import NOTHING
 from diagnostics.model.ways import DRIFTS, WAYS
 from diagnostics.model.ways.comes_and_goes import COMES_AND_GOES
 from diagnostics.preprocessing.levels import CERTAIN_RATIO, DOUBTED, RARE
@@ -28,49 +20,6 @@ _SHOWN = 1.0  # evidence that excludes a way to fail, or suggests one
 _NO_READING = (FaultKind.LATE, FaultKind.COPY, FaultKind.WEAK)  # but frames, a cell, a gain
 
 Floats = NDArray[np.float64]
-
-
-def judged_by_model(
-    model: Model, stream: StreamState, layout: SensorLayout, rate: float, full_scale: float
-) -> Judged:
-    """Return what the model says of the log behind a ``stream``.
-
-    Args:
-        model: of the array.
-        stream: the log.
-        layout: of its cells.
-        rate: expected share of healthy cells among those that are faulty.
-        full_scale: of a reading.
-    """
-    log = model.log_of_record(stream.record())
-    if stream.crosstalk is not None:
-        log.disturbed[:] = True
-    aliases, _ = find_aliasing(stream, partial(model.log_likelihood, log))
-    # what a pad shares looks alike on lines that nothing touches
-    touched = (log.load > NOTHING).any(axis=0)
-    loaded = touched & ~log.disturbed
-    # lines of one cell each: which of the two is the copy is told by the model
-    aliases = [
-        fault for fault in aliases if loaded[list(fault.cells)].any() and len(fault.cells) > 2
-    ]
-    misread = np.zeros(len(loaded), bool)
-    misread[[cell for fault in aliases for cell in fault.cells]] = True
-    judgement, still = judged_with_objects(model, log, layout, misread)
-    found = findings(judgement, stream, full_scale, rate)
-    follows = shown(judgement) & (found.probability < DOUBTED)
-    return Judged(
-        found=found,
-        aliases=aliases,
-        shown=follows & touched & stream.touched & model.living,
-        evidence={
-            "spatial": found.weight,
-            "temporal": np.zeros(len(found.weight)),
-            "events": found.events.astype(np.float64),
-        },
-        still=still,
-        contradicting=float(judgement.disturbed[model.present].mean()),
-        pulled=partial(model.lines.pulled, judgement.observed),
-    )
 
 
 def findings(
@@ -139,7 +88,6 @@ def findings(
     weak = refuted == REFUTED_KINDS.index(FaultKind.WEAK)
     gain = np.where(weak, told, np.nan)
     reads_more = gain > 1
-    typical = typical_reading(stream)
     return CellFindings(
         faulty=faulty,
         # how many others are faulty makes no wire of those that move
@@ -170,7 +118,7 @@ def findings(
         of_wire=failing.probability,
         share=failing.share,
         as_one=failing.as_one,
-        typical=np.where(np.abs(typical - reading) <= 2 * log.symbols.tolerance, typical, reading),
+        typical=reading,
     )
 
 

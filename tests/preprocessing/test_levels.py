@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from conftest import rough_fit
+from conftest import without_calibration
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -39,7 +39,7 @@ def lifted(
 
 @pytest.fixture(scope="module")
 def fitted() -> SelfDiagnosis:
-    with rough_fit():
+    with without_calibration():
         return SelfDiagnosis(LAYOUT).fit(lifted(presses(0), 1))
 
 
@@ -100,7 +100,7 @@ def test_exchanged_rows_are_found_at_other_levels(fitted: SelfDiagnosis):
 
 @pytest.fixture(scope="module")
 def uneven() -> SelfDiagnosis:
-    with rough_fit():
+    with without_calibration():
         return SelfDiagnosis(LAYOUT).fit([f * GAIN for f in presses(0)])
 
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from conftest import rough_fit
+from conftest import without_calibration
 
 import adaptfault as af
 from diagnostics import Fault, SelfDiagnosis, SensorLayout, inject
@@ -40,7 +40,7 @@ def reference() -> list[np.ndarray]:
 
 @pytest.fixture(scope="module")
 def fitted(reference) -> SelfDiagnosis:
-    with rough_fit():
+    with without_calibration():
         return SelfDiagnosis(LAYOUT).fit(reference)
 
 

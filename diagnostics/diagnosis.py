@@ -733,10 +733,10 @@ class SelfDiagnosis:
         # each other; nor is a line that a shorted crossing pulls.
         shown = judged.shown
         shorts = [f.cells[0] for f in causes if f.kind is FaultKind.SHORT and f.line is None]
-        # a cell that reads a part of its load may be pulled
-        misleads = inferred.copy()
-        misleads[[c for f in causes if f.kind is FaultKind.WEAK for c in f.cells]] = False
         if judged.pulled is not None and shorts:
+            # a cell that reads a part of its load may be pulled
+            misleads = inferred.copy()
+            misleads[[c for f in causes if f.kind is FaultKind.WEAK for c in f.cells]] = False
             pulled = judged.pulled(self._place[np.array(shorts)], misleads[self._order])
             causes = pulling(causes, pulled[self._place], self.layout)
             shown = shown & ~pulled

@@ -297,7 +297,7 @@ def _judge_logs(
     """Let a model know the evidence of each way that healthy cells reach, lines and groups with
     them, in logs that are held out, with dead cells beside.
 
-    In the first half of the logs it is told who is healthy. What cells reach there bounds the
+    In the first two thirds of the logs it is told who is healthy. What cells reach there bounds the
     evidence in the others, in which it finds them by itself: without a bound, some healthy cell of
     a long log always looks faulty, and misleads the others once it is left out.
     """

@@ -214,11 +214,6 @@ class Recorder:
     longest: float = np.inf
     age: int = 0
 
-    def __len__(self) -> int:
-        """Number of pieces."""
-        last = 0 if self.last is None else len(self.last)
-        return sum(map(len, self.complete)) + last
-
     def extend(
         self, frames: NDArray[np.floating], numbers: Cells, *, begins: Mask | None = None
     ) -> Recorder:
@@ -233,8 +228,9 @@ class Recorder:
             return self
         if begins is None:
             begins = np.arange(len(frames)) == 0
-        fresh = self._fresh(frames) | begins
-        cut, changes = self._cuts(frames)
+        previous = self._before(frames)
+        fresh = self._fresh(frames, previous) | begins
+        cut, changes = self._cuts(frames, previous)
         age = since_begin(begins) + np.where(begins.cumsum() == 0, self.age, 0)
         cut &= age >= self.longest
         age_after = int(age[-1]) + 1
@@ -285,28 +281,32 @@ class Recorder:
             age=age_after,
         )
 
-    def _fresh(self, frames: NDArray[np.floating]) -> Mask:
-        """Return the frames ``[t, D]`` that do not repeat the one before, bool ``[t]``."""
+    def _before(self, frames: NDArray[np.floating]) -> NDArray[np.floating]:
+        """Return the frame before each one, ``[t, D]``; NaN: there was none."""
         before = np.full_like(frames, np.nan)
         before[1:] = frames[:-1]
         if self.given is not None:
             before[0] = self.given
+        return before
+
+    def _fresh(self, frames: NDArray[np.floating], before: NDArray[np.floating]) -> Mask:
+        """Return the frames ``[t, D]`` that do not repeat the one before, bool ``[t]``."""
         missing = np.isnan(frames)
         same = (frames == before) | (missing & np.isnan(before))
         found: Mask = ~same.all(axis=1) | missing.all(axis=1)
         found[0] |= self.given is None
         return found
 
-    def _cuts(self, frames: NDArray[np.floating]) -> tuple[Mask, Array]:
+    def _cuts(
+        self, frames: NDArray[np.floating], before: NDArray[np.floating]
+    ) -> tuple[Mask, Array]:
         """Return the frames ``[t, D]`` with which joined recordings begin, bool ``[t]``, and how
         much changed in the last frames."""
-        before = np.concatenate([frames[:1] if self.given is None else self.given[None], frames])
-        step = np.nan_to_num(np.diff(before, axis=0))
+        step = np.nan_to_num(frames - before)
         least = _CUT * self.tolerance
         appear = (step > least).sum(axis=1)
         vanish = (step < -least).sum(axis=1)
         both = np.minimum(appear, vanish) >= max(2, _CELLS * frames.shape[1])
-        both &= self.tolerance > 0
         changes = self.changes if len(self.changes) else np.zeros(self.length, np.float32)
         change = np.concatenate([changes, np.abs(step).sum(axis=1).astype(np.float32)])
         usual = sliding_window_view(change, self.length)[:-1].max(axis=1)
@@ -350,15 +350,11 @@ def since_begin(begins: Mask) -> Cells:
 
 
 def record_of(
-    recordings: Sequence[NDArray[np.floating]],
-    length: int,
-    as_one: AsOne | None = None,
-    tolerance: float = 0.0,
-    longest: float = np.inf,
+    recordings: Sequence[NDArray[np.floating]], length: int, as_one: AsOne | None = None
 ) -> Record:
     """Return the record of recordings ``[T, D]`` each, with ``length`` frames a piece; NaN:
-    missing. ``as_one``, ``tolerance``, ``longest``: of :class:`Recorder`."""
-    recorder = Recorder(length, tolerance, as_one=as_one, longest=longest)
+    missing. ``as_one``: of :class:`Recorder`."""
+    recorder = Recorder(length, as_one=as_one)
     frame = 0
     for one in recordings:
         recorder = recorder.extend(one, frame + np.arange(len(one)))

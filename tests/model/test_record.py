@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from diagnostics.model.record import UNIT, Recorder, frames_of_piece, record_of
+from diagnostics.model.record import UNIT, Record, Recorder, frames_of_piece, record_of
 
 LENGTHS = st.lists(st.integers(1, 40), min_size=1, max_size=5)
 
@@ -80,20 +80,26 @@ def joined(seed: int) -> np.ndarray:
     return frames
 
 
+def in_one(frames: np.ndarray, longest: int) -> Record:
+    """Return the record of frames that came as one recording."""
+    numbers = np.arange(len(frames))
+    return Recorder(8, 10.0, longest=longest).extend(frames, numbers).record(len(frames))
+
+
 def test_recordings_that_were_joined_begin_with_a_cut():
-    record = record_of([joined(0)], 8, tolerance=10.0, longest=30)
+    record = in_one(joined(0), longest=30)
     assert record.begins[record.first].tolist() == [0, 30]
     assert set(record.recording) == {0}
 
 
 def test_a_recording_as_long_as_those_of_the_reference_has_no_cut():
-    record = record_of([joined(0)], 8, tolerance=10.0, longest=31)
+    record = in_one(joined(0), longest=31)
     assert record.begins[record.first].tolist() == [0]
 
 
 def test_noise_is_no_cut():
     frames = joined(0) + 200 * np.random.default_rng(1).normal(size=(60, 20))
-    record = record_of([frames], 8, tolerance=10.0, longest=1)
+    record = in_one(frames, longest=1)
     assert record.first.sum() <= 2  # the first of all may be one
 
 

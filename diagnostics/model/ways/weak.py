@@ -2,7 +2,6 @@
 
 What the others say, and the past of the cell as it would read with its usual gain, give P(level);
 the levels are then those of the other gain. It is estimated from the last contacts: gains fade.
-Such a cell moves by itself as well: there is no more evidence than of that.
 
 Not detected: a gain between 0.7 and 1.4; one whose loads stay below those that count as none.
 """

@@ -7,8 +7,8 @@ anything, a logistic regression with balanced classes is fitted,
 
     log odds = a + surprisal + temporal
 
-a near ``Calibrator.cold().offset[0]`` means that a cold start is calibrated. Each kind of array
-counts alike.
+a near ``diagnostics.decision.calibration.OFFSET[0, 0]`` means that a cold start is calibrated. Each
+kind of array counts alike.
 """
 
 from __future__ import annotations
@@ -43,14 +43,14 @@ def cells_at_rest(bench: Bench) -> np.ndarray:
             for frames in given:
                 stream.extend(frames)
             stream = stream.complete()
-            spatial = stream.spatial()
+            spatial = stream.cold.spatial(stream)
             still = stream.present & stream.rests() & spatial.scored & ~stream.runs.moved
             cells = np.flatnonzero(still & (spatial.surprisal > 0))
             found.append(
                 np.stack(
                     [
                         spatial.surprisal[cells],
-                        stream.temporal()[cells],
+                        stream.cold.temporal(stream)[cells],
                         np.isin(cells, list(kind_of_cells(dead))),
                     ],
                     1,

@@ -127,7 +127,7 @@ def read(whole: np.ndarray, bench: Bench) -> np.ndarray:
 def inspected(log: Log, bench: Bench) -> af.Inspection:
     """Return the inspection of a log with the reference."""
     reference = [bench.recordings.frames[i] for i in bench.reference]
-    return af.inspect(log, bench.proving, reference=reference)
+    return af.inspect(log, bench.fitted, reference=reference)
 
 
 def blamed_and_wires(inspection: af.Inspection) -> np.ndarray:
@@ -219,7 +219,7 @@ def monitored(bench: Bench) -> Iterator[Count]:
     """Healthy streams of 40 recordings through the Monitor."""
     raised = 0
     for _, log, _ in bench.logs(IN_USE):
-        monitor = Monitor(bench.proving)
+        monitor = Monitor(bench.fitted)
         for frame in np.concatenate(log):
             raised += sum(fault.probability > 0 for fault in monitor.update(frame))
     yield Count("a healthy stream: alarms", raised, bench.count, higher=False)

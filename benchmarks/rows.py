@@ -165,14 +165,6 @@ class Bench:
         made = OwnMethod(self.method, self.layout) if self.method else SelfDiagnosis(self.layout)
         return made.fit([frames[i] for i in self.reference])
 
-    @cached_property
-    def proving(self) -> SelfDiagnosis | OwnMethod:
-        """The diagnosis with the proof of life; a detector has none."""
-        if self.method:
-            return self.fitted
-        fitted = SelfDiagnosis(self.layout, proof_of_life=True)
-        return fitted.fit([self.recordings.frames[i] for i in self.reference])
-
     def logs(self, length: int = 6) -> Iterator[tuple[int, Log, np.random.Generator]]:
         """Yield seed, log and a generator for its faults."""
         for seed in range(10_000 * self.repeat, 10_000 * self.repeat + self.count):
@@ -742,7 +734,7 @@ def moving(bench: Bench) -> Iterator[Count]:
                     frames[:, cell] = broke[:, cell]
             wrong = np.abs(np.concatenate(seen) - np.concatenate(log)) > VISIBLE * span
             can = np.intersect1d(dead, np.flatnonzero(wrong.sum(axis=0) >= TESTABLE))
-            diagnosis = bench.proving.diagnose(seen)
+            diagnosis = bench.fitted.diagnose(seen)
             found = np.flatnonzero(diagnosis.fault_set.mask)
             testable += len(can)
             hit += len(np.intersect1d(found, can))
@@ -762,7 +754,7 @@ def proven(bench: Bench) -> Iterator[Count]:
     blamed = alive = used = 0
     for _, log, _ in bench.logs(IN_USE):
         tested = in_use(log, rest, span) & bench.layout.present.ravel()
-        diagnosis = bench.proving.diagnose(log)
+        diagnosis = bench.fitted.diagnose(log)
         blamed += len(diagnosis.fault_set)
         used += int(tested.sum())
         alive += int((diagnosis.verdicts[tested] == Verdict.ALIVE).sum())
@@ -804,7 +796,7 @@ def failing(bench: Bench) -> Iterator[Count]:
             gone = fails(load, rng)
             seen = whole.copy()
             seen[np.ix_(gone, of_wire)] = rest[of_wire]
-            diagnosis = bench.proving.diagnose(parted(seen, log))
+            diagnosis = bench.fitted.diagnose(parted(seen, log))
             wrong = np.abs(seen - whole)[:, of_wire] > VISIBLE * span
             can = of_wire[wrong.sum(axis=0) >= TESTABLE]
             logs += 1
@@ -834,7 +826,7 @@ def crossing(bench: Bench) -> Iterator[Count]:
         load = np.clip(whole - rest, 0, None)
         shorted = healthy.with_faults(StuckCell(cell, 0.0)).read(load)
         seen = whole + shorted - healthy.read(load)
-        diagnosis = bench.proving.diagnose(parted(seen, log))
+        diagnosis = bench.fitted.diagnose(parted(seen, log))
         wrong = (np.abs(seen - whole) > VISIBLE * span).sum(axis=0) >= TESTABLE
         others = np.setdiff1d(np.flatnonzero(wrong), [cell])
         logs += 1
@@ -867,7 +859,7 @@ def worn(bench: Bench) -> Iterator[Count]:
         gain = np.linspace(1, WORN, len(whole))[:, None]
         seen = whole.copy()
         seen[:, patch] = rest[patch] + gain * (whole - rest)[:, patch]
-        diagnosis = bench.proving.diagnose(parted(seen, log))
+        diagnosis = bench.fitted.diagnose(parted(seen, log))
         can = patch[used[patch]]
         logs += 1
         found += len(diagnosis.fault_set & set(can.tolist()))

@@ -11,21 +11,13 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.special import expit, logit
 
 from diagnostics.decision.address_aliasing import find_aliasing
 from diagnostics.decision.by_recording import with_recordings
-from diagnostics.decision.calibration import Calibrator, faulty_at, kinds
 from diagnostics.decision.certificate import Certificate, certify
-from diagnostics.decision.line_cover import candidate_groups
+from diagnostics.decision.judged import Judged
 from diagnostics.decision.result import Diagnosis
-from diagnostics.decision.root_causes import (
-    OF_WIRES,
-    CellFindings,
-    cut_off,
-    pulling,
-    root_causes,
-)
+from diagnostics.decision.root_causes import cut_off, pulling, root_causes
 from diagnostics.decision.serialization import (
     Arrays,
     from_state,
@@ -33,33 +25,17 @@ from diagnostics.decision.serialization import (
     to_state,
     write_state,
 )
-from diagnostics.decision.static_load import StaticLoad
-from diagnostics.decision.static_loads import find_static_loads
-from diagnostics.events.constant_runs import SHORTEST_RUN
-from diagnostics.evidence.life import PIECE, Life
-from diagnostics.evidence.life.pulled_lines import pulled_lines
+from diagnostics.evidence.cold_start import judged_cold
 from diagnostics.evidence.reference import Reference, highest_reading, living
-from diagnostics.evidence.spatial import Exclusion, Spatial
 from diagnostics.evidence.stream_state import StreamState
 from diagnostics.faults import Fault, FaultKind
 from diagnostics.healthy.reference_faults import find_reference_faults, never_moved
 from diagnostics.layout import SensorLayout
 from diagnostics.model import Model, fit_model
-from diagnostics.model.findings import findings, shown
-from diagnostics.model.objects import judged_with_objects
-from diagnostics.model.symbols import NOTHING
+from diagnostics.model.findings import judged_by_model
 from diagnostics.preprocessing.array_likes import plain_array
 from diagnostics.preprocessing.copies import find_copies
-from diagnostics.preprocessing.levels import (
-    CERTAIN_RATIO,
-    DOUBTED,
-    EXPECTED,
-    LEAST_LOADED,
-    LOW,
-    MAJORITY,
-    RARE,
-    SLIGHT,
-)
+from diagnostics.preprocessing.levels import LEAST_LOADED, LOW, SLIGHT
 from diagnostics.preprocessing.load import LoadDirection
 from diagnostics.preprocessing.quantiles import known_quantile
 from diagnostics.preprocessing.readings import RecordingBlocks
@@ -86,14 +62,7 @@ from diagnostics.when.reference_findings import (
     reference_findings,
 )
 
-SCHEMA = "adaptfault.diagnoser/2"
-
-# P(faulty) of silent, intermittent, noisy and drifting cells, which have their own thresholds
-_ENGINES = ("events", "model")
-_WHOLE = 1e-6  # by which a whole number may be missed after a conversion to loads and back
-_CERTAIN = 1 - RARE
-
-LogRatio = Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64]]
+SCHEMA = "adaptfault.diagnoser/3"
 
 
 @dataclass(frozen=True)
@@ -102,35 +71,10 @@ class Fitted:
 
     layout: SensorLayout
     false_discovery_rate: float
-    calibrator: Calibrator
     reference: Reference | None
     load: LoadDirection | None = None
     certificate: Certificate | None = None
     model: Model | None = None
-
-
-@dataclass(frozen=True)
-class _Judged:
-    """What is known of each cell of a log, before root causes.
-
-    Attributes:
-        found: findings about each cell.
-        aliases: causes of lines that read the same.
-        still: objects that lie still.
-        shown: bool ``[D]``, cells that depend on the others as healthy ones do.
-        contradicting: share of the cells that contradict them, where nobody is blamed for it.
-        evidence: by name, ``[D]``.
-        pulled: returns the cells on lines that shorted crossings pull, bool ``[D]``, of these cells
-            and of those that are faulty, bool ``[D]``; None: lines are not tested.
-    """
-
-    found: CellFindings
-    aliases: Sequence[Fault]
-    still: Sequence[StaticLoad]
-    shown: NDArray[np.bool_]
-    contradicting: float
-    evidence: Mapping[str, NDArray[np.float64]]
-    pulled: Callable[[NDArray[np.intp], NDArray[np.bool_]], NDArray[np.bool_]] | None = None
 
 
 def _no_progress(share: float) -> None:
@@ -143,15 +87,9 @@ class SelfDiagnosis:
     Args:
         layout: the array.
         false_discovery_rate: expected share of healthy cells in F.
-        proof_of_life: with a reference, a cell that moves is ALIVE only where it depends on the
-            others as a healthy cell does (:mod:`diagnostics.evidence.life`), so that dead cells
-            that move are found. Without it, what moves counts as alive.
-        engine: ``"events"``, or ``"model"``: the one model of the array in time
-            (:mod:`diagnostics.model`), which is to replace it; it needs a reference.
 
     Attributes:
         reference_: the healthy reference, after :meth:`fit`; None: cold start.
-        calibrator_: calibration of the log likelihood ratios; defaults before :meth:`fit`.
         load_: how readings become loads; None: load raises the reading.
         copies_: int ``[n]``, of which recording each one of the reference is a copy; its own number
             where it is none. None: not fitted.
@@ -160,7 +98,6 @@ class SelfDiagnosis:
     """
 
     reference_: Reference | None = None
-    calibrator_: Calibrator = Calibrator.cold()
     copies_: NDArray[np.intp] | None = None
     _certificate: Certificate | None = None
     _model: Model | None = None
@@ -173,14 +110,8 @@ class SelfDiagnosis:
         layout: SensorLayout,
         *,
         false_discovery_rate: float = 0.006,
-        proof_of_life: bool = True,
-        engine: str = "events",
     ) -> None:
-        if engine not in _ENGINES:
-            raise ValueError(f"engine: expected {' or '.join(map(repr, _ENGINES))}, got {engine!r}")
         self.layout = layout
-        self.engine = engine
-        self.proof_of_life = proof_of_life
         self.load_ = LoadDirection.declared(layout)
         self._planes, self._order = axis_planes(layout)
         self._place = np.argsort(self._order)  # of each cell among the planes
@@ -191,8 +122,6 @@ class SelfDiagnosis:
         return {
             "layout": self.layout,
             "false_discovery_rate": self.false_discovery_rate,
-            "proof_of_life": self.proof_of_life,
-            "engine": self.engine,
         }
 
     def set_params(self, **params: Any) -> SelfDiagnosis:
@@ -210,7 +139,6 @@ class SelfDiagnosis:
         self.reference_ = None
         self._model = None
         self.copies_ = None
-        self.calibrator_ = Calibrator.cold()
         self._certificate = None
         self._held_out = None
         return self
@@ -268,12 +196,11 @@ class SelfDiagnosis:
         recordings: RecordingBlocks,
         progress: Callable[[float], None],
         suspected: NDArray[np.float64] | None = None,
-        calibrator: Calibrator | None = None,
         *,
         strict: bool = False,
     ) -> SelfDiagnosis:
         """Fit; ``suspected``: P(dead) ``[D]`` of cells that are dead if they never move; None:
-        found here. ``calibrator``: None: fitted here."""
+        found here."""
         progress(0.0)
         present = self.layout.present.ravel()
         healthy = recordings.valid(self.layout.full_scale, present).whole(present)
@@ -304,15 +231,7 @@ class SelfDiagnosis:
         usual = UsualSizes.of(list(healthy), near, living(layout, dead).present.ravel())
         floors = lowest_floors(healthy, self.reference_.scale.baseline, living(layout, dead))
         self.reference_ = replace(self.reference_, sizes=usual, floors=floors)
-        if self.engine == "model":
-            self._model = fit_model(list(healthy), layout, dead > 0, progress=progress)
-        if self._model is not None:
-            calibrator = Calibrator.cold()
-        elif self.proof_of_life:
-            self.reference_ = self.reference_.with_life(healthy, layout)
-        if calibrator is None:
-            calibrator = Calibrator.fit(healthy, living(layout, dead), progress=progress)
-        self.calibrator_ = calibrator
+        self._model = fit_model(list(healthy), layout, dead > 0, progress=progress)
         self._certificate = None
         self._held_out = (recordings.given, dead[self._place])
         progress(1.0)
@@ -339,14 +258,16 @@ class SelfDiagnosis:
     ) -> Callable[
         [Sequence[NDArray[Any]], Sequence[Sequence[NDArray[Any]]]], list[NDArray[np.bool_]]
     ]:
-        """Return what fits to recordings with this calibration and returns F of each log, bool
-        ``[D]``; ``dead``: P(dead) ``[D]`` of cells that never move."""
+        """Return what fits to recordings and returns F of each log, bool ``[D]``.
+
+        ``dead``: P(dead) ``[D]`` of cells that never move.
+        """
 
         def blamed(
             rest: Sequence[NDArray[Any]], logs: Sequence[Sequence[NDArray[Any]]]
         ) -> list[NDArray[np.bool_]]:
             part = SelfDiagnosis(**self.get_params())
-            part._fit(RecordingBlocks(list(rest)), _no_progress, dead, self.calibrator_)
+            part._fit(RecordingBlocks(list(rest)), _no_progress, dead)
             return [part._diagnosed(RecordingBlocks(list(log))).fault_set.mask for log in logs]
 
         return blamed
@@ -511,7 +432,6 @@ class SelfDiagnosis:
             Fitted(
                 self.layout,
                 self.false_discovery_rate,
-                self.calibrator_,
                 self.reference_,
                 self.load_,
                 self._certificate,
@@ -533,18 +453,14 @@ class SelfDiagnosis:
         try:
             fitted = from_state(Fitted, about, arrays)
             diagnoser = cls(fitted.layout, false_discovery_rate=fitted.false_discovery_rate)
-            diagnoser.calibrator_ = fitted.calibrator
             diagnoser.reference_ = fitted.reference
             diagnoser.load_ = fitted.load
             diagnoser._certificate = fitted.certificate
             diagnoser._model = fitted.model
-            diagnoser.engine = "events" if fitted.model is None else "model"
             if fitted.load is not None:
                 fitted.load.check(fitted.layout)
             if fitted.reference is not None:
                 fitted.reference.check(diagnoser._planes)
-                proves = fitted.reference.life is not None or fitted.model is not None
-                diagnoser.proof_of_life = proves
         except KeyError as error:
             raise ValueError(f"the stored diagnosis is damaged: {error} is missing") from None
         except (TypeError, ValueError, AttributeError) as error:
@@ -575,27 +491,22 @@ class SelfDiagnosis:
         """Return the state before any frame. Only tiles with a ``needed`` cell (bool ``[D]``; None:
         all) are scored."""
         reference = self.reference_ or Reference.unknown(self._planes)
-        exclusion = self.calibrator_.exclusion if reference.model else Exclusion()
         order = self._order if self.layout.axes > 1 else None
         recorder = None if self._model is None else self._model.recorder()
-        return StreamState(self._planes, reference, exclusion, needed, self.load_, order, recorder)
+        return StreamState(self._planes, reference, needed, self.load_, order, recorder)
 
-    def evaluate(
-        self, stream: StreamState, *, n_recordings: int = 1, life: Life | None = None
-    ) -> Diagnosis:
+    def evaluate(self, stream: StreamState, *, n_recordings: int = 1) -> Diagnosis:
         """Return the diagnosis of the log behind ``stream``.
 
         Args:
             stream: the state of the log.
             n_recordings: of which it consists.
-            life: the last result of :meth:`proof`, which is then not repeated, nor are the lines
-                of a shorted crossing tested; None: they are.
 
         Raises:
             ValueError: no frame with a reading was received yet.
         """
         with one_thread():
-            return self._evaluated(stream, n_recordings, life)
+            return self._evaluated(stream, n_recordings)
 
     def evaluate_recordings(
         self, stream: StreamState, spans: Spans, lengths: Sequence[int], tolerance: float
@@ -613,108 +524,28 @@ class SelfDiagnosis:
             ValueError: as :meth:`evaluate`.
         """
         held = self._held(spans, tolerance, None)
-        stream.held = np.asarray(held.suspect.any(axis=0))[self._order]
         whole = self.evaluate(stream, n_recordings=len(lengths))
         return with_recordings(whole, held, lengths, tolerance, None)
 
-    def _evaluated(self, stream: StreamState, n_recordings: int, life: Life | None) -> Diagnosis:
+    def _evaluated(self, stream: StreamState, n_recordings: int) -> Diagnosis:
         """Return the diagnosis; arguments as in :meth:`evaluate`."""
         stream = stream.complete()
         if not stream.received.any():
             raise ValueError("the recordings hold no frame with a reading: nothing to diagnose")
-        if self._model is None:
-            judged = self._by_events(stream, life)
-        else:
-            judged = self._by_model(self._model, stream)
-        return self._concluded(stream, judged, n_recordings)
+        return self._concluded(stream, self._of_cells(stream), n_recordings)
 
-    def _by_model(self, model: Model, stream: StreamState) -> _Judged:
-        """Return what the model says of the log behind a ``stream``."""
-        log = model.log_of_record(stream.record())
-        if stream.crosstalk is not None:
-            log.disturbed[:] = True
-        aliases, _ = find_aliasing(stream, partial(model.log_likelihood, log))
-        # what a pad shares looks alike on lines that nothing touches
-        touched = (log.load > NOTHING).any(axis=0)
-        loaded = touched & ~log.disturbed
-        # lines of one cell each: which of the two is the copy is told by the model
-        aliases = [
-            fault for fault in aliases if loaded[list(fault.cells)].any() and len(fault.cells) > 2
-        ]
-        misread = np.zeros(len(loaded), bool)
-        misread[[cell for fault in aliases for cell in fault.cells]] = True
-        judgement, still = judged_with_objects(model, log, self._planes, misread)
-        found = findings(judgement, stream, self.layout.full_scale, self.false_discovery_rate)
-        follows = shown(judgement) & (found.probability < DOUBTED)
-        evidence = {
-            "spatial": found.weight,
-            "temporal": np.zeros(len(found.weight)),
-            "events": found.events.astype(np.float64),
-        }
-        return _Judged(
-            found=found,
-            aliases=aliases,
-            still=still,
-            shown=follows & touched & stream.touched & model.living,
-            contradicting=float(judgement.disturbed[model.present].mean()),
-            evidence=evidence,
-            pulled=partial(model.lines.pulled, judgement.observed),
-        )
+    def _of_cells(self, stream: StreamState) -> Judged:
+        """Return what is known of each cell of a log, before root causes."""
+        rate = self.false_discovery_rate
+        full_scale = self.layout.full_scale
+        if self._model is not None:
+            return judged_by_model(self._model, stream, self._planes, rate, full_scale)
+        cold = stream.cold
+        assert cold is not None
+        aliases = find_aliasing(stream, partial(cold.log_likelihood, stream))
+        return judged_cold(cold, stream, aliases, rate, full_scale)
 
-    def _by_events(self, stream: StreamState, life: Life | None) -> _Judged:
-        """Return what contact events and the proof of life say; arguments as in evaluate."""
-        aliases, copies = find_aliasing(stream, stream.log_likelihood)
-        explained = copies
-        still = list[StaticLoad]()
-        tests_lines = life is None
-        if life is None:
-            life = self._proof(stream, copies)
-        log_ratio = self._log_ratio(stream, life)
-        spatial, found = self._tested(stream, explained, log_ratio, life)
-        for beside in (False, True):
-            while True:
-                faulty = found.probability >= DOUBTED if beside else found.faulty
-                loads = find_static_loads(stream, spatial, faulty, copies, still, beside=beside)
-                others = copies.copy()
-                others[[cell for load in loads for cell in load.cells]] = True
-                if (others == explained).all():
-                    break
-                tested = self._tested(stream, others, log_ratio, life)
-                if tested[1].probability.sum() >= found.probability.sum():  # it explains nothing
-                    break
-                still, explained, (spatial, found) = loads, others, tested
-        alone = found.weight
-        weight = found.weight.copy()
-
-        def together(surprisal: NDArray[np.float64]) -> NDArray[np.float64]:
-            # By the chain rule of probability each cell of a group is conditioned on those before
-            # it: on half of them, about the mean of conditioning on all and on none.
-            return alone + np.maximum(log_ratio(surprisal, surprisal) - alone, 0.0) / 2
-
-        groups = self._groups(found, stream, together(spatial.initial), explained)
-        for group, surprisal in zip(
-            groups, stream.each_excluded(spatial, explained, groups), strict=True
-        ):
-            weight[group] = np.maximum(weight[group], together(surprisal)[group])
-        intermittency = stream.intermittency
-        evidence = {
-            "spatial": spatial.evidence + spatial.offset + spatial.gain,
-            "temporal": np.where(
-                spatial.scored, stream.temporal(), intermittency.blinking + intermittency.noisy
-            ),
-            "events": spatial.events.astype(np.float64),
-        }
-        return _Judged(
-            found=replace(found, weight=weight),
-            aliases=aliases,
-            still=still,
-            shown=stream.touched & (life.shown | (stream.reference.dead > 0)),
-            contradicting=life.contradicting,
-            evidence=evidence,
-            pulled=partial(self._pulled, stream, life) if tests_lines else None,
-        )
-
-    def _concluded(self, stream: StreamState, judged: _Judged, n_recordings: int) -> Diagnosis:
+    def _concluded(self, stream: StreamState, judged: Judged, n_recordings: int) -> Diagnosis:
         """Return the diagnosis of a log by what is known of each cell."""
         found = judged.found.of(self._place)
         causes, possible = root_causes(found, judged.aliases, self.layout)
@@ -766,29 +597,6 @@ class SelfDiagnosis:
             contradicting=judged.contradicting,
         )
 
-    def proof(self, stream: StreamState) -> Life:
-        """Return whether cells depend on each other as healthy ones do."""
-        stream = stream.complete()
-        with one_thread():
-            _, copies = find_aliasing(stream, stream.log_likelihood)
-            return self._proof(stream, copies)
-
-    def _proof(self, stream: StreamState, explained: NDArray[np.bool_]) -> Life:
-        """Return whether cells depend on each other; ``explained`` ones (bool ``[D]``) are out."""
-        if stream.reference.life is None or stream.noisier:
-            return Life.assumed(stream.layout.n_cells)
-        evidence = stream.evidence_of_life()
-        # Cells that move by themselves mislead the spatial test; those that never moved, or hold a
-        # value in some recordings, say nothing yet.
-        first = stream.proof_of_life(evidence, explained, ~stream.runs.moved | stream.held)
-        life = first.finish()
-        log_ratio = self._log_ratio(stream, life)
-        spatial, found = self._tested(stream, explained, log_ratio, life)
-        # Cells that the spatial test suspects predict no others.
-        suspected = spatial.scored & (found.faulty | stream.suspected(spatial)) | stream.held
-        life = stream.proof_of_life(evidence, explained, suspected, first).finish()
-        return life if stream.crosstalk is None else life.undecided()
-
     def _unused(
         self,
         stream: StreamState,
@@ -809,56 +617,10 @@ class SelfDiagnosis:
         pad = self.layout.pad_of
         return np.asarray(unused & np.isin(pad, pad[unused & blamed]))
 
-    @staticmethod
-    def _pulled(
-        stream: StreamState, life: Life, shorted: NDArray[np.intp], faulty: NDArray[np.bool_]
-    ) -> NDArray[np.bool_]:
-        """Return the cells on lines that a shorted crossing pulls, bool ``[D]``; ``faulty`` ones
-        (bool ``[D]``) tell nothing of a line."""
-        evidence = None
-        if stream.reference.life is not None and not stream.noisier:
-            evidence = stream.evidence_of_life()
-        if evidence is None:
-            return np.zeros_like(faulty)
-        known = stream.received & ~stream.silent & ~life.refuted & ~faulty
-        return pulled_lines(evidence.log, shorted, known)
-
-    @staticmethod
-    def _misleading(stream: StreamState, life: Life) -> NDArray[np.bool_]:
-        """Return the cells that are refuted and move, or were before they came to hold a value,
-        bool ``[D]``."""
-        runs = stream.runs
-        before = runs.moved & life.mostly_before(runs.start)
-        return life.certain & ((runs.length < SHORTEST_RUN) | before)
-
-    def _tested(
-        self, stream: StreamState, explained: NDArray[np.bool_], log_ratio: LogRatio, life: Life
-    ) -> tuple[Spatial, CellFindings]:
-        """Return the findings of the spatial test without ``explained`` cells (bool ``[D]``).
-
-        Moving cells that are refuted predict no others.
-        """
-        spatial = stream.spatial(explained, self._misleading(stream, life))
-        return spatial, self._found(stream, spatial, explained, log_ratio, life)
-
     def _falls(self, stream: StreamState) -> bool | None:
         """Return whether loads, as the stream holds them, may fall; None: nothing tells."""
         is_known = stream.load is not None or self.reference_ is not None
         return False if is_known or self.layout.rest != "learn" else None
-
-    def _judged(
-        self, log: RecordingBlocks, crosstalk: Crosstalk | None, held: NDArray[np.bool_]
-    ) -> Diagnosis:
-        """Return the diagnosis of a log, without a gain of the whole array where that explains
-        faults; ``held`` cells (bool ``[D]``) predict no others."""
-        found = self._diagnosed(log, crosstalk=crosstalk, held=held)
-        usual = None
-        if found.faults and crosstalk is None:
-            usual = self.without_gain(log.given)
-        if usual is None:
-            return found
-        without = self._diagnosed(usual, held=held)
-        return without if without.n_lost < found.n_lost else found
 
     def without_gain(self, recordings: ArrayLike | Sequence[ArrayLike]) -> RecordingBlocks | None:
         """Return a log without the gain that the whole array has in it; None where it has none, or
@@ -891,12 +653,9 @@ class SelfDiagnosis:
         log: RecordingBlocks,
         needed: NDArray[np.bool_] | None = None,
         crosstalk: Crosstalk | None = None,
-        held: NDArray[np.bool_] | None = None,
     ) -> Diagnosis:
         stream = self.stream(needed)
         stream.crosstalk = crosstalk
-        if held is not None:
-            stream.held = held[self._order]
         for i in range(len(log)):
             stream.begin_recording()
             for frames in log[i : i + 1].blocks():
@@ -911,7 +670,7 @@ class SelfDiagnosis:
         held = self._held(self.spans(log), tolerance, classes)
 
         def judged(some: RecordingBlocks) -> Diagnosis:
-            return self._judged(some, crosstalk, np.asarray(held.suspect.any(axis=0)))
+            return self._diagnosed(some, crosstalk=crosstalk)
 
         def of_part(some: tuple[int, ...]) -> Diagnosis:
             return judged(RecordingBlocks([log.given[i] for i in some]))
@@ -960,195 +719,6 @@ class SelfDiagnosis:
         cold = SelfDiagnosis(layout)
         cold.reference_ = Reference.unknown(layout, rest)
         return cold._diagnosed(log, needed)
-
-    def _found(
-        self,
-        stream: StreamState,
-        spatial: Spatial,
-        explained: NDArray[np.bool_],
-        log_ratio: LogRatio,
-        life: Life,
-    ) -> CellFindings:
-        """Return the findings about each cell; ``explained`` cells (bool ``[D]``) are left out."""
-        reference = stream.reference
-        runs = stream.runs
-        intermittency = stream.intermittency
-        present = stream.present
-        silent = stream.silent & ~explained
-        known = spatial.scored & ~runs.moved & (reference.dead > 0)
-        odds = log_ratio(spatial.evidence, spatial.surprisal)
-        stuck = self.calibrator_.probability(odds, kinds(stream), spatial.scored & ~known)
-        # At the level at which its pad rests nothing tells whether a cell is stuck.
-        at_rest = stream.rests_with_pad()
-        stuck[at_rest] = np.minimum(stuck[at_rest], DOUBTED)
-        stuck[known] = reference.dead[known]
-        delivers = present & ~explained & ~silent
-        intermittent = intermittency.intermittent & delivers
-        noisy = intermittency.excess & delivers
-        drifting = (
-            delivers
-            & ~intermittent
-            & ~noisy
-            & spatial.drifting
-            & (stream.crosstalk is None)
-            & ~(life.floats & np.isfinite(spatial.factor))
-        )
-        # a group that fails as a whole explains what its cells do
-        as_one = delivers & life.as_one
-        intermittent &= ~as_one
-        noisy &= ~as_one
-        drifting &= ~as_one
-        certain = silent | intermittent | noisy | drifting
-        # Side by side, cells that never return to their baseline carry something that lies still.
-        never_unloaded = stream.lowest > stream.scale.baseline + stream.scale.near
-        beside = stream.layout.beside
-        carries = never_unloaded & ((beside >= 0) & never_unloaded[beside]).any(axis=1)
-        judged = delivers & runs.moved & ~certain & ~carries & (reference.life is not None)
-        # The model of life errs where its reference has no like: only what is far beyond its limits
-        # is faulty.
-        refuted = np.where(judged, expit(life.evidence + logit(EXPECTED) - CERTAIN_RATIO / 2), 0.0)
-        # What lies still on a pad was not known when life was tested.
-        pad = stream.layout.pad_of
-        clear = ~np.isin(pad, pad[explained])
-        # a constant run tells more: its value, its onset; but not of a wire that comes and goes
-        on_wire = judged & clear & (life.wire >= 0)
-        by_life = judged & (refuted > stuck) & (stuck < MAJORITY) | on_wire
-        # at rest, a cell that reads little of its load holds a value
-        by_life |= judged & np.isfinite(life.gain)
-        probability = np.where(
-            present, np.where(certain, _CERTAIN, np.maximum(stuck, refuted)), 0.0
-        )
-        faulty = faulty_at(np.where(certain, 0.0, probability), self.false_discovery_rate)
-        faulty = (faulty | certain) & present & ~explained
-        value = runs.value
-        rests = spatial.scored & stream.rests()
-        blinks_to = np.where(
-            2 * intermittency.high > intermittency.blinks,
-            self.layout.full_scale,
-            np.maximum(stream.lowest, 0.0),
-        )
-        held = stream.reading(value)
-        beyond = spatial.scored & ~rests
-        kind = np.where(by_life & faulty, life.kind, -1)
-        # Not certain one by one: a wire that fails now and then makes its cells fail together.
-        unsure = judged & ~faulty & ~life.shown & (life.kind < len(OF_WIRES)) & (life.evidence > 0)
-        unsure &= clear
-        told = np.where(unsure, life.kind, kind)
-        source = np.where(life.source < 0, np.nan, self._order[life.source])
-        of_life = np.stack(
-            [
-                held,
-                stream.reading(stream.scale.baseline),
-                life.lag * PIECE,
-                source,
-                life.highest,
-                life.gain,
-            ]
-        )
-        weight = log_ratio(spatial.surprisal, spatial.surprisal)
-        return CellFindings(
-            faulty=faulty,
-            # A cell that moved is alive, unless it is suspected since.
-            alive=present & ~explained & ~faulty & runs.moved & (probability < DOUBTED),
-            silent=silent,
-            rests=rests,
-            full=beyond & (held >= self.layout.full_scale - 2 * reference.tolerance),
-            zero=None if stream.load is None else beyond & (held <= 2 * reference.tolerance),
-            intermittent=intermittent,
-            noisy=noisy,
-            drifting=drifting,
-            gain=np.where(drifting, spatial.factor, life.gain),
-            value=np.where(
-                told >= 0,
-                of_life[told, np.arange(len(kind))],
-                np.where(intermittent, stream.reading(blinks_to), held),
-            ),
-            since=np.select(
-                [silent, intermittent, noisy, drifting, told >= 0],
-                [
-                    runs.missed_since,
-                    intermittency.blinks_since,
-                    intermittency.noisy_since,
-                    spatial.since,
-                    life.since,
-                ],
-                runs.start,
-            ),
-            probability=probability,
-            # A cell at rest supports a broken line by the events alone, without the prior of its
-            # value.
-            weight=np.where(known, CERTAIN_RATIO, np.where(told >= 0, life.evidence, weight)),
-            events=np.where(
-                intermittent, intermittency.blinks, np.where(told >= 0, life.units, spatial.events)
-            ),
-            known=known,
-            refuted=kind,
-            unsure=np.where(unsure, life.kind, -1),
-            wire=np.where(on_wire, life.wire, -1),
-            of_wire=life.of_wire,
-            share=life.share,
-            as_one=life.as_one,
-            typical=self._typical(stream),
-        )
-
-    @staticmethod
-    def _typical(stream: StreamState) -> NDArray[np.float64]:
-        """Return the reading of each cell's constant run, ``[D]``: in whole counts where it has
-        such readings.
-
-        A value that fills more than half of the run is its median. Otherwise the median is between
-        the ends of the run: then it is the whole number beside their middle that is closer to the
-        last reading.
-        """
-        runs = stream.runs
-        held = stream.reading(runs.value)
-        ends = np.stack([stream.reading(one) for one in (runs.low, runs.high, runs.last)])
-        ends = np.where(np.isfinite(ends), ends, 0.5)  # no reading: not whole
-        whole = (np.abs(ends - np.rint(ends)) < _WHOLE).all(axis=0)
-        last = np.rint(ends[2])
-        beside = np.where(last > held, np.ceil(held - _WHOLE), np.floor(held + _WHOLE))
-        counts = np.where(2 * runs.same > runs.length, last, beside)
-        return np.where(whole, counts, held)
-
-    def _log_ratio(self, stream: StreamState, life: Life) -> LogRatio:
-        """Return the function from evidence and summed surprisal to the calibrated log likelihood
-        ratio, ``[D]`` each.
-
-        The events tell something of cells with a surprisal, and with a reference of all. Faulty
-        cells that move mislead the search for events: then these say no more of cells at rest than
-        the proof of life does.
-        """
-        temporal = stream.temporal()
-        kind = kinds(stream)
-        known = stream.reference.model is not None
-        misled = bool(self._misleading(stream, life).any()) & stream.rests()
-        most = np.where(misled, np.maximum(life.evidence, 0.0), np.inf)
-
-        def log_ratio(
-            evidence: NDArray[np.float64], surprisal: NDArray[np.float64]
-        ) -> NDArray[np.float64]:
-            tested = (surprisal > 0) | known
-            return np.minimum(self.calibrator_.calibrate(evidence, temporal, kind, tested), most)
-
-        return log_ratio
-
-    def _groups(
-        self,
-        found: CellFindings,
-        stream: StreamState,
-        weight: NDArray[np.float64],
-        explained: NDArray[np.bool_],
-    ) -> list[NDArray[np.intp]]:
-        """Return the groups of cells at rest that one broken line would explain."""
-        if stream.reference.model is None:
-            return []
-        consistent = found.rests & ~found.known & ~explained
-        contradicting = found.alive | ~(found.rests | found.silent) & stream.present
-        place = self._place
-        groups = candidate_groups(
-            consistent[place], contradicting[place], weight[place], self.layout
-        )
-        return [place[group] for group in groups]
 
 
 def _with_causes(

@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from diagnostics.evidence.life import Life
 from diagnostics.preprocessing.array_likes import plain_array
 from diagnostics.preprocessing.readings import SEGMENT
 from diagnostics.threads import Worker, one_thread
@@ -28,8 +27,9 @@ if TYPE_CHECKING:
 Key = tuple[Line | None, int]
 Frames = list[tuple[int, NDArray[np.float64]]]  # lost before it, frame [D]
 
-_PROVEN_EVERY = 4  # evaluations: a size
-_A_CELL = 1e-3  # seconds that an evaluation with a proof of life takes, on a busy machine
+# seconds that an evaluation takes on a busy machine: for a cell, and for a reading of its record
+_A_CELL = 1e-3
+_A_READING = 2e-5
 _LONGEST_GAP = 86400.0  # seconds; after a longer one the clock was set
 
 
@@ -38,13 +38,13 @@ class Monitor:
 
     After each segment of 32 frames a thread of the monitor's own evaluates them, and the 16th frame
     after it tells what changed. Which frame tells which fault does not depend on the speed of the
-    machine: where the evaluation is not complete by then, that frame waits for it. A large array is
-    given more frames: those of 1 ms a cell, at its rate.
+    machine: where the evaluation is not complete by then, that frame waits for it. A large array,
+    and a long log, are given more frames: those of 1 ms a cell and of 20 us a reading of the record
+    that is judged, at the rate of the array.
 
     While a wire breaks, healthy cells beside it look faulty for an evaluation, so a change is
     reported once the next evaluation confirms it, at most about 80 frames after it becomes
-    detectable. Every fourth evaluation proves the life of all cells, so that a dead cell that moves
-    is reported up to some 200 frames later. :meth:`diagnosis` evaluates at once.
+    detectable in a short log. :meth:`diagnosis` evaluates at once.
 
     Args:
         fitted: a fitted :class:`SelfDiagnosis`; an unfitted one is a cold start.
@@ -56,16 +56,11 @@ class Monitor:
         import scipy.optimize  # noqa: F401
 
         self._diagnoser = fitted
-        stream = fitted.stream()
-        proves = stream.reference.life is not None
-        life = Life.unknown(fitted.layout.n_cells) if proves else None
-        self._record = _Record(stream, life)
+        self._record = _Record(fitted.stream())
         self._work: Future[_Record] | _Record | None = None  # with those given
         self._given: Frames = []
         self._new: Frames = []
-        takes = fitted.layout.n_cells * _A_CELL * fitted.layout.rate
-        self._told_after = max(SEGMENT // 2, ceil(takes))  # frames
-        self._every = SEGMENT * ceil(self._told_after / SEGMENT)
+        self._told_after, self._every = self._pace(0)
         self._worker = Worker()
         self._known: dict[Key, Fault] = {}
         self._evaluated: Diagnosis | None = None
@@ -115,8 +110,17 @@ class Monitor:
             self._begin()
         return changes
 
+    def _pace(self, pieces: int) -> tuple[int, int]:
+        """Return after how many frames an evaluation of so many pieces tells what changed, and the
+        next one begins."""
+        layout = self._diagnoser.layout
+        takes = layout.n_cells * (_A_CELL + _A_READING * pieces) * layout.rate
+        told_after = max(SEGMENT // 2, ceil(takes))
+        return told_after, SEGMENT * ceil(told_after / SEGMENT)
+
     def _begin(self) -> None:
         """Begin to evaluate the new frames."""
+        self._told_after, self._every = self._pace(self._record.stream.pieces)
         self._given = self._new
         self._new = []
         self._work = self._worker.begin(
@@ -153,12 +157,11 @@ class Monitor:
         record = self._so_far()
         if not record.stream.complete().received.any():
             return ()
-        record = _concluded(self._diagnoser, record)
-        self._record = record
+        diagnosis = self._diagnoser.evaluate(record.stream)
+        self._record = replace(record, diagnosis=diagnosis)
         self._work = None
         self._new = []
-        assert record.diagnosis is not None
-        return self._changes(record.diagnosis, final=True)
+        return self._changes(diagnosis, final=True)
 
     def diagnosis(self) -> Diagnosis:
         """Return the diagnosis of all frames so far, as :meth:`SelfDiagnosis.diagnose` does.
@@ -232,14 +235,10 @@ class _Record:
 
     Attributes:
         stream: the state after them; it does not change any more.
-        life: what the last proof of life says; None: the reference has no model of it.
-        evaluations: since that proof.
         diagnosis: None: the last frames completed no segment, and were not evaluated.
     """
 
     stream: StreamState
-    life: Life | None
-    evaluations: int = 0
     diagnosis: Diagnosis | None = None
 
 
@@ -269,17 +268,4 @@ def _evaluated(diagnoser: SelfDiagnosis, record: _Record, given: Frames) -> _Rec
     record = replace(record, stream=stream, diagnosis=None)
     if not completed or not stream.received.any():
         return record
-    evaluations = record.evaluations + 1
-    if evaluations >= _PROVEN_EVERY:
-        return _concluded(diagnoser, record)
-    diagnosis = diagnoser.evaluate(stream, life=record.life)
-    return replace(record, evaluations=evaluations, diagnosis=diagnosis)
-
-
-def _concluded(diagnoser: SelfDiagnosis, record: _Record) -> _Record:
-    """Return the record with a proof of life and the diagnosis that it leads to."""
-    life = record.life
-    if life is not None:
-        life = diagnoser.proof(record.stream)
-    diagnosis = diagnoser.evaluate(record.stream, life=life)
-    return replace(record, life=life, evaluations=0, diagnosis=diagnosis)
+    return replace(record, diagnosis=diagnoser.evaluate(stream))

@@ -201,88 +201,6 @@ def healthy_model() -> Figure:
     return figure
 
 
-def evidence() -> Figure:
-    """Draw how the evidence of four cells grows with the frames of a log."""
-    true, seen, _ = log()
-    ends = list(range(25, len(seen) + 1, 25))
-    grown = [reference().diagnose(seen[:end]).evidence["spatial"] for end in ends]
-    idle = int(true.max(axis=0).argmin())
-    cells = {
-        OPEN: ("open cell", RED),
-        STUCK: (f"stuck from frame {ONSET}", "#e67e22"),
-        idle: ("idle cell", GREY),
-    }
-    figure, axes = panels(1, 1)
-    for cell, (name, colour) in cells.items():
-        axes[0].plot(root_load(seen[:, cell]), color=colour, label=name)
-        axes[1].plot(
-            ends,
-            [ratios[cell] for ratios in grown],
-            marker="o",
-            markersize=3,
-            color=colour,
-            label=name,
-        )
-    axes[0].plot(
-        root_load(true[:, OPEN]),
-        color=RED,
-        linewidth=0.8,
-        linestyle=":",
-        label="the open cell, if healthy",
-    )
-    axes[0].set(title="reading", xlabel="frame", ylabel="root load", ylim=(-0.02, 1))
-    axes[0].legend(ncols=2, fontsize=7)
-    axes[1].axhline(0, color="black", linewidth=0.6)
-    axes[1].set(
-        title="evidence of a constant reading", xlabel="frames seen", ylabel="log likelihood ratio"
-    )
-    axes[1].legend()
-    return figure
-
-
-def calibration() -> Figure:
-    """Draw log ratios of healthy and dead cells, the fitted curve, and how often cells of a given P
-    are dead."""
-    ratios = []
-    probabilities = []
-    dead = []
-    for seed in range(10, 50):
-        rng = np.random.default_rng(seed)
-        cells = rng.choice(LAYOUT.n_cells, 13, replace=False)
-        kinds = rng.choice([FaultKind.OPEN, FaultKind.SHORT], len(cells))
-        faults = [Fault(kind, (int(cell),)) for cell, kind in zip(cells, kinds, strict=True)]
-        seen = inject(np.concatenate(healthy(seed)[:3]), faults, LAYOUT, seed=seed)
-        found = reference().diagnose(seen)
-        still = np.ptp(seen, axis=0) == 0
-        ratios.append(found.evidence["spatial"][still])
-        probabilities.append(found.probability[still])
-        dead.append(np.isin(np.flatnonzero(still), cells))
-    ratio, probability, is_dead = map(np.concatenate, (ratios, probabilities, dead))
-    figure, axes = panels(1, 1, 1)
-    bins = np.linspace(-4, 20, 25)
-    axes[0].hist(np.clip(ratio[~is_dead], -4, 20), bins, color=BLUE, alpha=0.7, label="healthy")
-    axes[0].hist(np.clip(ratio[is_dead], -4, 20), bins, color=RED, alpha=0.7, label="dead")
-    axes[0].set(
-        title="constant cells of 40 logs", xlabel="raw log ratio", ylabel="cells", yscale="log"
-    )
-    axes[0].legend()
-    order = np.argsort(ratio)
-    axes[1].plot(ratio[order], probability[order], ".", color=GREY, markersize=2)
-    axes[1].set(title="posterior", xlabel="raw log ratio", ylabel="P(faulty)", xlim=(-4, 20))
-    edges = np.array([0, 0.05, 0.2, 0.4, 0.6, 0.8, 0.95, 1.0001])
-    which = np.digitize(probability, edges) - 1
-    for k in range(len(edges) - 1):
-        of_bin = which == k
-        if of_bin.sum() >= 5:
-            mean = is_dead[of_bin].mean()
-            n = of_bin.sum()
-            error = np.sqrt(max(mean * (1 - mean), 1 / n) / n)
-            axes[2].errorbar(probability[of_bin].mean(), mean, error, fmt="o", color=BLUE)
-    axes[2].plot([0, 1], [0, 1], color="black", linewidth=0.6)
-    axes[2].set(title="reliability", xlabel="P(faulty)", ylabel="share that is dead")
-    return figure
-
-
 def root_causes() -> Figure:
     """Draw the evidence of single cells and the wire that explains them."""
     _, _, found = log()
@@ -416,8 +334,6 @@ FIGURES: dict[str, Callable[[], Figure]] = {
     "events": events,
     "ageing": ageing,
     "healthy-model": healthy_model,
-    "evidence": evidence,
-    "calibration": calibration,
     "root-causes": root_causes,
     "repair": repair,
     "forecast": forecast,

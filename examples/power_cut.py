@@ -27,7 +27,6 @@ import numpy as np
 from disk.power_cut_states import Trace, Tree, build
 
 from diagnostics import FaultSet, Line, SelfDiagnosis, SensorLayout, inject, line_fault
-from diagnostics.decision.calibration import Calibrator
 
 LAYOUT = SensorLayout(1, 4, 4)
 CLASSES = ("nothing", "softer", "harder")
@@ -44,7 +43,7 @@ def linear(layout: SensorLayout, n_classes: int, length: int) -> Any:
 
 @contextmanager
 def small_versions() -> Iterator[None]:
-    """Leave out the export and the calibration, which take seconds and write nothing of their own,
+    """Leave out the export and most of the fit, which take seconds and write nothing of their own,
     and allow the model above."""
     import adaptfault as af
 
@@ -56,7 +55,8 @@ def small_versions() -> Iterator[None]:
             add_onnx=mock.Mock(side_effect=absent),
             graph_of=mock.Mock(side_effect=absent),
         ),
-        mock.patch.object(Calibrator, "fit", return_value=Calibrator()),
+        mock.patch("diagnostics.model.predictor._STEPS", 100),
+        mock.patch("diagnostics.model.fitting._LOGS", 8),
     ):
         yield
 

@@ -22,7 +22,6 @@ from adaptfault.data.simulated_grasps import simulate
 from adaptfault.models import forest
 from adaptfault.models.store import save_model
 from diagnostics import Fault, FaultSet, Line, SelfDiagnosis, SensorLayout, inject, line_fault
-from diagnostics.decision.calibration import Calibrator
 
 _TREES = forest.TREES
 _WITH_TREES = ("forest", "targets")
@@ -325,17 +324,18 @@ def all_trees(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @contextmanager
-def without_calibration() -> Iterator[None]:
-    """Let a fit keep the calibration of a cold start: its simulated logs take most of the time and
-    have tests."""
+def rough_fit() -> Iterator[None]:
+    """Let a fit take fewer steps and judge fewer logs, which take most of its time, where accuracy
+    is not what is proven."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Calibrator, "fit", lambda recordings, layout, *, progress: Calibrator())
+        patch.setattr("diagnostics.model.predictor._STEPS", 200)
+        patch.setattr("diagnostics.model.fitting._LOGS", 8)
         yield
 
 
 @pytest.fixture
-def uncalibrated() -> Iterator[None]:
-    with without_calibration():
+def roughly_fitted() -> Iterator[None]:
+    with rough_fit():
         yield
 
 
@@ -354,7 +354,7 @@ def made_bundle(small_grasps: Recordings, made_once) -> Path:
             "5",
             "--quiet",
         ]
-        with without_export(), without_calibration():
+        with without_export(), rough_fit():
             assert main(command) == 0
 
     return made_once("bundle", make) / "robot.bundle"
@@ -411,7 +411,7 @@ def forces_home(small_grasps: Recordings, made_once) -> Path:
         write_forces(home, held)
         training = ["train", str(home / "grasps"), "--targets", str(home / "targets.csv")]
         training += ["--epochs", "8", "--learning-rate", "1e-3", "--quiet"]
-        with without_export(), without_calibration():
+        with without_export(), rough_fit():
             assert main([*training, "--out", str(home / "robot.bundle")]) == 0
         bundled = Bundle.open(home / "robot.bundle").parts.adapter()
         save_model(

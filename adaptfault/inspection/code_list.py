@@ -370,7 +370,7 @@ CODES: tuple[Code, ...] = (
         "Something lies still on the array: an object or a strap.",
         "Its load is in each reading of its cells.",
         "Its cells are not tested.",
-        method="diagnostics.decision.static_loads",
+        method="diagnostics.model.objects",
         needs="reference",
     ),
     Code(

@@ -15,11 +15,11 @@ from adaptfault.inspection.find_changes import find_changed_readings, find_senso
 from adaptfault.inspection.result import Finding, Inspection, finding_of, of_diagnosis
 from diagnostics import Diagnosis, FaultSet, SelfDiagnosis, SensorLayout
 from diagnostics.diagnosis import checked_recordings
-from diagnostics.evidence.drift import GAIN
 from diagnostics.preprocessing.readings import RecordingBlocks
 from diagnostics.sensor.common_mode import CommonMode, find_common_mode
 from diagnostics.sensor.converter_change import find_converter_change
 from diagnostics.sensor.disturbance import Disturbance, find_disturbances, find_sentinel
+from diagnostics.sensor.gain import GAIN
 from diagnostics.sensor.sensor_change import SensorChange, amplification
 from diagnostics.sensor.shared import measured
 

@@ -116,31 +116,6 @@ def solve(
     return tuple(causes)
 
 
-def candidate_groups(
-    consistent: NDArray[np.bool_],
-    contradicting: NDArray[np.bool_],
-    weight: NDArray[np.float64],
-    layout: SensorLayout,
-) -> list[NDArray[np.intp]]:
-    """Return the groups of cells that one fault would explain, where enough of them support it.
-
-    The fault is a wire broken as a whole or at one end.
-
-    Args:
-        consistent, contradicting: as for :func:`solve`.
-        weight: float ``[D]``, an upper estimate of the log likelihood ratio.
-        layout: the array.
-    """
-    supporting = consistent & (weight >= SUSPICIOUS)
-    return [
-        cells[consistent[cells]]
-        for line in layout.lines
-        if line.kind in _WIRES and supporting[layout.cells_on(line)].sum() >= _MIN_OF_GROUP
-        for cells in _silenced(line, contradicting, layout)
-        if supporting[cells].sum() >= _MIN_OF_GROUP
-    ]
-
-
 def _least_support(behind: int) -> int:
     """Return how many cells must support a break with so many cells behind it."""
     return max(_MIN_OF_GROUP, min(_MIN_SUPPORT, -(-2 * behind // 3)))

@@ -22,7 +22,7 @@ from diagnostics.layout import SensorLayout
 from diagnostics.preprocessing.levels import ANYWHERE, MAJORITY, SLIGHT, SUSPICIOUS
 from diagnostics.wiring import LineKind, action, counted
 
-# Of the cells that are refuted, in the order of ``evidence.life.FAULTS``, and weak ones.
+# Of cells that move and are proved not to be alive.
 REFUTED_KINDS = (
     FaultKind.FLOATING,
     FaultKind.INTERMITTENT,
@@ -65,8 +65,8 @@ class CellFindings:
         weight: float, log likelihood ratio faulty : healthy.
         events: int, number of events that tested the cell, or number of its blinks.
         known: cells that were dead in the reference already.
-        refuted: int, number of the fault in ``evidence.life.FAULTS`` of cells that move and are
-            proved not to be alive; -1: others.
+        refuted: int, number in ``REFUTED_KINDS`` of cells that move and are proved not to be alive;
+            -1: others.
         unsure: int, the same of cells that may have one of the ``OF_WIRES``; -1: others.
         wire: int, number of the proven wire of such a cell, from 0; -1: others.
         of_wire: float, P(this wire fails).

@@ -1,13 +1,11 @@
-"""Constant runs: since when each cell holds one value, and the jump into that run.
+"""Constant runs: since when each cell holds one value.
 
 Finds, for each cell, the longest run at the end of the log within +- tolerance of one value:
 
     start = min { s : max(x_s..x_T) - min(x_s..x_T) <= 2 tolerance }
 
 A stuck cell is constant from its onset on, up to the dither of the converter. So is a healthy cell
-without contact, or under a static load: a constant run alone is no evidence of a fault. The spatial
-test (:mod:`~diagnostics.evidence.spatial`) and the size of the jump
-(:mod:`~diagnostics.evidence.jumps`) decide.
+without contact, or under a static load: a constant run alone is no evidence of a fault.
 """
 
 from __future__ import annotations
@@ -24,8 +22,6 @@ from diagnostics.preprocessing.scale import Scale
 Floats = NDArray[np.float64]
 
 SHORTEST_RUN = 5  # frames; shorter runs are not tested
-_RECENT = 64  # frames since a cell last moved, while it counts as able to jump
-_COMPANY = 0.2  # share of the loaded cells that jump together when a grasp is released
 
 
 @dataclass(frozen=True)
@@ -37,10 +33,6 @@ class ConstantRuns:
         length: int ``[D]``, frames of the run with a reading.
         low, high: float ``[D]``, range of the readings in the run; inf and -inf before the first
         reading.
-        jump: float ``[D]``, change of the reading in the step into the run; 0 where the cell never
-            moved.
-        company: float ``[D]``, share of the loaded cells that jumped in the same direction in the
-            same step.
         last: float ``[D]``, the last reading; NaN: none yet.
         same: int ``[D]``, consecutive frames with exactly that reading.
         missed: int ``[D]``, consecutive frames without a reading, up to now.
@@ -51,8 +43,6 @@ class ConstantRuns:
     length: NDArray[np.intp]
     low: Floats
     high: Floats
-    jump: Floats
-    company: Floats
     last: Floats
     same: NDArray[np.intp]
     missed: NDArray[np.intp]
@@ -63,16 +53,14 @@ class ConstantRuns:
         """Return the state before any frame."""
         zero = np.zeros(n_cells, np.intp)
         nothing = np.full(n_cells, np.inf)
-        jump = np.zeros(n_cells)
         last = np.full(n_cells, np.nan)
-        return cls(zero, zero, nothing, -nothing, jump, jump, last, zero, zero, zero)
+        return cls(zero, zero, nothing, -nothing, last, zero, zero, zero)
 
     def extend(
         self,
         frames: Floats,
         numbers: NDArray[np.intp],
         tolerance: float,
-        baseline: Floats | float = 0.0,
     ) -> ConstantRuns:
         """Return the runs after more frames.
 
@@ -80,7 +68,6 @@ class ConstantRuns:
             frames: ``[t, D]``, t >= 1; NaN = missing, which neither ends nor extends a run.
             numbers: int ``[t]``, of the frames, ascending.
             tolerance: a run stays within +- this of one value.
-            baseline: float ``[D]``, readings without contact.
         """
         missing = np.isnan(frames)
         any_missing = bool(missing.any())
@@ -92,14 +79,10 @@ class ConstantRuns:
         readings = held(frames, self.last)
         start = self.start
         length = self.length + received
-        jump = self.jump
-        company = self.company
         broke = np.flatnonzero(high - low > 2 * tolerance)
         if len(broke):
             start = start.copy()
             length = length.copy()
-            jump = jump.copy()
-            company = company.copy()
             # The first frame of the new run lies in this block: search backwards.
             highest = np.maximum.accumulate(top[::-1, broke], axis=0)
             lowest = np.minimum.accumulate(bottom[::-1, broke], axis=0)
@@ -113,26 +96,8 @@ class ConstantRuns:
                 )
             start[broke] = numbers[first]
             length[broke] = np.minimum(count, received[broke])
-            # The changes of all cells in the steps into these runs.
-            steps = np.flatnonzero(np.bincount(first))
-            which = np.searchsorted(steps, first)
-            before = readings[steps]
-            after = readings[steps + 1]
-            step = after - before
-            size = np.fmax(after, before) - baseline
-            drastic = np.maximum(0.5 * size, 4 * tolerance)
-            # Cells that never moved may be broken from the start and could not have jumped.
-            able = (high - low > 2 * tolerance) | self.moved
-            able |= self.length < _RECENT
-            loaded = np.maximum(_in_each((size > 4 * tolerance) & able), 1)
-            # At a release all cells fall, at a grasp all rise; when many break at once, some fall
-            # and some rise. So only changes in the same direction count.
-            share = np.array([_in_each(step < -drastic), _in_each(step > drastic)]) / loaded
             low[broke] = lowest[count - 1, at]
             high[broke] = highest[count - 1, at]
-            into = step[which, broke]
-            jump[broke] = np.where(np.isnan(into), 0.0, into)
-            company[broke] = share[(jump[broke] > 0).astype(np.intp), which]
         latest = (_changed(readings) * np.arange(1, len(readings), dtype=np.int32)[:, None]).max(
             axis=0
         )
@@ -142,9 +107,7 @@ class ConstantRuns:
             if any_missing
             else (np.zeros_like(same), self.missed_since)
         )
-        return ConstantRuns(
-            start, length, low, high, jump, company, readings[-1].copy(), same, missed, since
-        )
+        return ConstantRuns(start, length, low, high, readings[-1].copy(), same, missed, since)
 
     def _missed(
         self, missing: NDArray[np.bool_], numbers: NDArray[np.intp]
@@ -173,13 +136,6 @@ class ConstantRuns:
         moved: NDArray[np.bool_] = self.start > 0
         return moved
 
-    @property
-    def alone(self) -> NDArray[np.bool_]:
-        """bool ``[D]``, False where many cells jumped together with the cell, as when a grasp
-        ends."""
-        alone: NDArray[np.bool_] = self.company < _COMPANY
-        return alone
-
 
 def same_for(readings: Floats, before: NDArray[np.intp]) -> NDArray[np.intp]:
     """Return the consecutive frames with exactly the same reading, at each frame, int ``[t, D]``.
@@ -201,13 +157,6 @@ def _changed(readings: Floats) -> NDArray[np.bool_]:
     return changed
 
 
-def _in_each(which: NDArray[np.bool_]) -> NDArray[np.int32]:
-    """Return the number of True cells in each frame of ``[t, D]``."""
-    # int32: faster than NumPy's default
-    count: NDArray[np.int32] = which.sum(axis=1, dtype=np.int32)
-    return count
-
-
 def segments(
     recording: Floats, scale: Scale, length: int = SEGMENT
 ) -> Iterator[tuple[Floats, NDArray[np.intp], ConstantRuns]]:
@@ -217,5 +166,5 @@ def segments(
     for first in range(0, len(recording), length):
         frames = recording[first : first + length]
         numbers = np.arange(first, first + len(frames))
-        runs = runs.extend(frames, numbers, scale.near / 2, scale.baseline)
+        runs = runs.extend(frames, numbers, scale.near / 2)
         yield frames, numbers, runs

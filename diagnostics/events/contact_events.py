@@ -160,16 +160,14 @@ class ContactEvent:
         size = float(np.sqrt((before @ before) * (now @ now)))
         return size <= _MIN_AMPLITUDE**2 or float(before @ now) >= _SAME_PLACE * size
 
-    def persists(
-        self, part: Summary, root_near: float, start: NDArray[np.intp], jumped: NDArray[np.bool_]
-    ) -> bool:
+    def persists(self, part: Summary, root_near: float, start: NDArray[np.intp]) -> bool:
         """Return whether most of its loaded cells hold the same value in ``part``; see
         ``EventLog.extend``.
 
         Cells that never moved, or that are constant for longer than the event lasts, may be broken
         and do not count.
         """
-        own = (self.mean() > root_near) & (start >= self.since) & ~jumped
+        own = (self.mean() > root_near) & (start >= self.since)
         held = own & (start > 0) & (start < self.end) & (part.most > root_near)
         return int(held.sum()) > _PERSISTING * int(own.sum())
 
@@ -209,7 +207,6 @@ class EventLog:
         numbers: NDArray[np.intp],
         root_near: float,
         start: NDArray[np.intp],
-        jumped: NDArray[np.bool_],
     ) -> EventLog:
         """Return the events after more frames.
 
@@ -219,9 +216,6 @@ class EventLog:
             root_near: the root load from which on a cell counts as loaded.
             start: int ``[D]``, first frame of the constant run of each cell. Only cells that move
                 in these frames decide whether a load is released: broken cells hold their value.
-            jumped: bool ``[D]``, cells that jumped to their value and may be broken. They do not
-                count for the size of the load; another part begins at the frame in which most of
-                them jumped.
         """
         kept = list(self.kept)
         largest = self.largest
@@ -230,12 +224,11 @@ class EventLog:
         ongoing = bool(kept) and not releasing  # the next part belongs to the last event
         begin = 0
         constant = start <= numbers[0]
-        # (moving, not broken)
-        weights = np.stack([~constant, ~(constant & jumped)], axis=1).astype(np.float32)
+        # (moving, all)
+        weights = np.stack([~constant, np.ones_like(constant)], axis=1).astype(np.float32)
         before = np.concatenate([root[:1] if last is None else last[None], root[:-1]])
         begins = self._begins(root, before, numbers, root_near, start)
-        broke = _most_common(start[jumped & ~constant])
-        edges = sorted({*begins, *np.flatnonzero(numbers == broke).tolist(), len(root)})
+        edges = sorted({*begins, len(root)})
         while begin < len(root):
             if releasing:
                 begin += _releasing_frames(root[begin:], last)
@@ -263,10 +256,9 @@ class EventLog:
                 part = Summary.of(ahead[:end], int(numbers[begin]), root_near)
                 low = lowest[end - 1]
                 high = highest[end - 1]
-                # Cells that broke do not begin another event.
-                same = ongoing and (part.first == broke or kept[-1].same_location(part, low))
+                same = ongoing and kept[-1].same_location(part, low)
                 follows = bool(kept) and begin not in begins
-                if same or (follows and kept[-1].persists(part, root_near, start, jumped)):
+                if same or (follows and kept[-1].persists(part, root_near, start)):
                     kept[-1] = kept[-1].grown(part, low, high)
                 else:
                     if kept:
@@ -360,7 +352,7 @@ def _release(load: Array, lowest: Array, highest: Array, weakest: float) -> int:
     none.
 
     Args:
-        load: root load, summed over the moving and over the working cells, ``[t, 2]``.
+        load: root load, summed over the moving and over all cells, ``[t, 2]``.
         lowest, highest: the same of the extremes of each cell so far, ``[t, 2]``.
         weakest: smaller changes are no release.
     """
@@ -379,11 +371,3 @@ def _releasing_frames(root: Array, last: Array | None) -> int:
     sums = root.sum(axis=1)
     before = np.concatenate([[sums[0] if last is None else last.sum()], sums[:-1]])
     return int(np.logical_and.accumulate(sums < before).sum())
-
-
-def _most_common(numbers: NDArray[np.intp]) -> int:
-    """Return the most frequent number, -1 if there is none."""
-    if not len(numbers):
-        return -1
-    found, times = np.unique(numbers, return_counts=True)
-    return int(found[times.argmax()])

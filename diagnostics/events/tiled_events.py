@@ -48,20 +48,17 @@ class TiledEvents:
         numbers: Cells,
         root_near: float,
         start: Cells,
-        jumped: NDArray[np.bool_],
     ) -> TiledEvents:
         """Return the events after more frames, see ``EventLog.extend``; tiles in which nothing
         moves do not change."""
         if len(self.tiles) == 1:
-            return self.replaced([self.of[0].extend(root, numbers, root_near, start, jumped)])
+            return self.replaced([self.of[0].extend(root, numbers, root_near, start)])
         of = list(self.of)
         moving = start > numbers[0]
         for i in self._needed:
             cells = self.tiles[i].inputs
             if moving[cells].any():
-                of[i] = of[i].extend(
-                    root[:, cells], numbers, root_near, start[cells], jumped[cells]
-                )
+                of[i] = of[i].extend(root[:, cells], numbers, root_near, start[cells])
         return self.replaced(of)
 
     def split(self, most: int, keep: int) -> tuple[TiledEvents, TiledEvents]:
@@ -76,11 +73,6 @@ class TiledEvents:
     def replaced(self, of: Sequence[EventLog]) -> TiledEvents:
         """Return the same tiles with other events."""
         return replace(self, of=tuple(of))
-
-    def holding(self, cells: NDArray[np.bool_]) -> Iterator[int]:
-        """Yield the needed tiles that have one of the ``cells`` (bool ``[D]``) among their
-        outputs."""
-        return (i for i in self._needed if cells[self.tiles[i].outputs].any())
 
     def kept(self) -> Iterator[tuple[int, EventLog]]:
         """Yield the tiles with events, and these."""

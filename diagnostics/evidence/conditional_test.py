@@ -5,10 +5,10 @@ Computes for event e and constant cell i the surprisal
 
     -w_e log P(cell i reads v_i throughout e | healthy, predictors)
 
-with weight w_e = 1 / (1 + 0.15 r_e), r_e earlier events that load the same cells (effective sample
-size, Kish 1965); Where the model knows the surroundings of a cell only (cold start), repeats tell
-nothing new: w_e = u_e = 1 / (1 + r_e); for a cell at rest w_e = 2.5 u_e / (1 + 0.15 (sum u - 1)),
-as any two events share the errors (design effect). P is the predicted probability of staying
+with r_e earlier events that load the same cells. The model knows the surroundings of a cell only,
+so that repeats tell nothing new: w_e = u_e = 1 / (1 + r_e); for a cell at rest
+w_e = 2.5 u_e / (1 + 0.15 (sum u - 1)), as any two events share the errors (design effect, Kish
+1965). P is the predicted probability of staying
 unloaded for a cell at its baseline, and of staying loaded near v_i for one that holds a load. In
 unusual events the model errs about many cells at once. So the probability is averaged over powers
 0.25 to 1 of the odds (tempered likelihoods), each with its posterior given the moving cells of the
@@ -36,9 +36,9 @@ _POWERS = (0.25, 0.5, 0.75, 1.0)  # of the likelihood of the model, in one event
 # pseudo-count of cells with a usual error; upper limit: all cells may be dead
 _PRIOR_CELLS = 4
 _MAX_INFLATION = 4.0
-_REPEATS = 0.15  # correlation of events that are the same
-# of an event without a reference; benchmarks/cold_calibration.py fits 2.9, at less precision
-_COLD_SCALE = 2.5
+_SHARED = 0.15  # correlation of the errors of two events
+# of an event; benchmarks/cold_calibration.py fits 2.9, at less precision
+_AT_REST = 2.5
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -154,32 +154,24 @@ class ConditionalTest:
         inflation = _inflation(expected, self.features, predictors)
         within = expected.within(values.low[held], values.high[held], held, inflation)
         likely[:, held] = expected.always[:, held] * within
-        surprisal = -self._weights(expected.own) * np.log(np.maximum(likely, P_MIN))
+        surprisal = -self._weights * np.log(np.maximum(likely, P_MIN))
         return expected, np.where(self.counted, surprisal, 0.0)
 
-    def novelty(self, own: bool) -> Floats:
-        """Return the weight w_e of each excerpt, ``[n, 1]``; ``own``: whether predictions are
-        specific to each cell."""
-        return novelty(self.repeats, own)
+    @property
+    def novelty(self) -> Floats:
+        """The weight u_e of each excerpt, ``[n, 1]``."""
+        return np.asarray(1 / (1 + self.repeats))
 
-    def _weights(self, own: bool) -> Floats:
-        """Return the weight of each excerpt for each cell, ``[n, D]`` or ``[n, 1]``, see the
-        module."""
-        weights = self.novelty(own)
-        if own:
-            return weights
-        scale = _COLD_SCALE / (1 + _REPEATS * (weights[self.begins].sum() - 1))
+    @property
+    def _weights(self) -> Floats:
+        """The weight w_e of each excerpt for each cell, ``[n, D]``, see the module."""
+        weights = self.novelty
+        scale = _AT_REST / (1 + _SHARED * (weights[self.begins].sum() - 1))
         return weights * np.where(self.cells.values.rests, scale, 1.0)
 
     def summed(self, surprisal: Floats) -> Floats:
         """Return the evidence ``[D]`` of all events, earlier ones included."""
         return np.where(self.cells.scored, self.cells.accumulated + surprisal.sum(axis=0), 0.0)
-
-
-def novelty(repeats: NDArray[np.intp], own: bool = True) -> Floats:
-    """Return the weight w_e of events with so many ``repeats`` before them; ``own``: predictions
-    are of each cell."""
-    return np.asarray(1 / (1 + (_REPEATS if own else 1.0) * repeats))
 
 
 def _excerpts(

@@ -11,17 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from diagnostics.evidence.intermittency import HealthyRates
-from diagnostics.evidence.jumps import JumpHistogram
-from diagnostics.evidence.life import LifeModel, fit_life
-from diagnostics.evidence.lower_limit import LowerLimit
-from diagnostics.evidence.noise_loss import NoiseLoss
-from diagnostics.evidence.pad_level import PadLimit
 from diagnostics.evidence.usual_duplicates import UsualDuplicates
 from diagnostics.healthy.model import HealthyModel
 from diagnostics.healthy.tiled_model import fit_healthy_model
 from diagnostics.preprocessing.baseline import baseline
 from diagnostics.preprocessing.noise import UsualNoise
-from diagnostics.preprocessing.offset import ReferenceOffset, highest_rests, levelled, levels
+from diagnostics.preprocessing.offset import ReferenceOffset, levelled, levels
 from diagnostics.preprocessing.readings import SEGMENT, RecordingBlocks
 from diagnostics.preprocessing.scale import Scale
 from diagnostics.preprocessing.tolerance import TOLERANCE, converter_step, tolerance_of
@@ -39,31 +34,21 @@ class Reference:
     Attributes:
         tolerance: readings within +- this of a value count as that value, in the layout's unit.
         scale: baseline and full scale.
-        jumps_seen: sizes of the jumps of healthy cells into constant runs.
-        least: lower limit of the readings of healthy cells.
-        noise_loss: longest runs of identical readings of healthy cells.
         offset: common offset of all cells.
         patience: repetitions of a frame after which it carries no information.
         usual: rates of blinks and excess noise of healthy cells.
         duplicates: coincidences that two healthy lines may have, and how often each pair agrees.
-        model: the healthy model; None: the k-NN spatial model of the log (cold start).
+        model: of contact events, for the wiring and for single gains; None: unknown.
         dead: float ``[D]``, P(dead) of the reference faults, 0 for all other cells.
         loaded_patience: the same of a frame with load; 0: as ``patience``.
-        beside: lower limit of the readings of healthy cells, relative to their pad; None: unknown.
-        life: how cells depend on each other; None: unknown.
         noise: what all cells have; None: unknown.
         sizes: how far cells move (:mod:`diagnostics.sensor.gain`); None: unknown.
         floors: float ``[2, pads]``, share of the highest reading of its row or column that hardly
             any cell reads less of (:mod:`diagnostics.sensor.crosstalk`); None: unknown.
-        rests: float ``[pads]``, how far above their baselines the cells of each pad rest together,
-            as a supply that other pads load does not sag; None: unknown.
     """
 
     tolerance: float
     scale: Scale
-    jumps_seen: JumpHistogram
-    least: LowerLimit
-    noise_loss: NoiseLoss
     offset: ReferenceOffset
     patience: int
     usual: HealthyRates
@@ -71,12 +56,9 @@ class Reference:
     model: HealthyModel | None
     dead: NDArray[np.float64]
     loaded_patience: int = 0
-    beside: PadLimit | None = None
-    life: LifeModel | None = None
     noise: UsualNoise | None = None
     sizes: UsualSizes | None = None
     floors: NDArray[np.float64] | None = None
-    rests: NDArray[np.float64] | None = None
 
     def repeats(self, layout: SensorLayout) -> Patience:
         """Return how often healthy frames repeat."""
@@ -94,18 +76,15 @@ class Reference:
         positive = (
             self.tolerance,
             self.scale.near,
-            self.noise_loss.recording,
             self.patience,
             *rates,
         )
         if not min(positive) > 0:
             raise ValueError(
-                f"expected positive tolerance, near, recording, patience and rates, got {positive}"
+                f"expected positive tolerance, near, patience and rates, got {positive}"
             )
         if self.model is not None:
             self.model.check(living(layout, self.dead))
-        if self.life is not None:
-            self.life.check(living(layout, self.dead))
 
     @classmethod
     def fit(
@@ -121,22 +100,16 @@ class Reference:
         layout = living(layout, dead)
         present = layout.present.ravel()
         level = levels(recordings, present, layout.full_scale)
-        as_read = recordings
         recordings = levelled(recordings, level)
-        readings = baseline(recordings, present, tolerance, layout.full_scale)
-        least = LowerLimit.fit(readings, present, tolerance, layout.full_scale)
+        highest = baseline(recordings, present, tolerance, layout.full_scale)
         # The baseline of a dead cell is unknown.
-        rest = np.where(dead > 0, np.median(readings.highest[present]), readings.highest)
+        rest = np.where(dead > 0, np.median(highest[present]), highest)
         scale = Scale(rest, 2 * tolerance, layout.full_scale)
-        jumps_seen = JumpHistogram.fit(recordings, scale)
         patience = Patience.fit(recordings, np.where(present, rest + scale.near, np.inf), SEGMENT)
         model = fit_healthy_model(recordings, layout, scale)
         return cls(
             tolerance,
             scale,
-            jumps_seen,
-            least,
-            NoiseLoss.fit(recordings, present),
             ReferenceOffset.fit(recordings, scale, present, float(np.ptp(level))),
             patience.idle,
             HealthyRates.fit(recordings, scale, layout),
@@ -145,37 +118,18 @@ class Reference:
             dead,
             # At another level every cell seems loaded.
             patience.idle if level.any() else patience.loaded,
-            PadLimit.fit(as_read, readings, layout, tolerance, float(np.ptp(level))),
             noise=UsualNoise.fit(recordings, present, converter_step(recordings, layout)),
-            rests=highest_rests(recordings, scale, layout),
-        )
-
-    def with_life(
-        self, recordings: Sequence[NDArray[np.float64]], layout: SensorLayout
-    ) -> Reference:
-        """Return the reference with the model of the proof of life, fitted to the same
-        recordings."""
-        layout = living(layout, self.dead)
-        recordings = levelled(
-            recordings, levels(recordings, layout.present.ravel(), layout.full_scale)
-        )
-        return replace(
-            self, life=fit_life(recordings, layout, self.scale, self.offset, self.tolerance)
         )
 
     @classmethod
     def unknown(cls, layout: SensorLayout, rest: NDArray[np.float64] | None = None) -> Reference:
-        """Return the defaults of a cold start: baselines ``rest`` (``[D]``; None: 0), no evidence
-        from jumps."""
+        """Return the defaults of a cold start: baselines ``rest`` (``[D]``; None: 0)."""
         tolerance = TOLERANCE * layout.full_scale
         rest = np.zeros(layout.n_cells) if rest is None else rest
         scale = Scale(rest, 2 * tolerance, layout.full_scale)
         return cls(
             tolerance,
             scale,
-            JumpHistogram.silent(),
-            LowerLimit.unknown(layout.n_cells),
-            NoiseLoss.unknown(layout.n_cells),
             ReferenceOffset(0.0, tolerance),
             2 * SEGMENT,
             HealthyRates.unknown(),

@@ -46,7 +46,7 @@ from diagnostics.preprocessing.scale import robust_moments
 
 if TYPE_CHECKING:
     from diagnostics.events.constant_runs import ConstantRuns
-    from diagnostics.evidence.term import ConstantCells
+    from diagnostics.layout import SensorLayout
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -81,13 +81,18 @@ class RestLevel:
         still = ended & (runs.length >= SEGMENT)
         return RestLevel(level, self.still | still, self.exact | (still & (runs.low == runs.high)))
 
-    def evidence(self, cells: ConstantCells) -> Floats:
+    def evidence(
+        self, runs: ConstantRuns, rests: Mask, tolerance: float, layout: SensorLayout
+    ) -> Floats:
         """Return the log likelihood ratio broken : healthy, ``[D]``; 0 for cells that are not
-        constant at rest."""
-        runs = cells.runs
-        rests = cells.rests
-        tolerance = cells.tolerance
-        layout = cells.layout
+        constant at rest.
+
+        Args:
+            runs: the constant runs.
+            rests: bool ``[D]``, cells whose run lies at their baseline.
+            tolerance: readings within +- this of a value count as that value.
+            layout: the array.
+        """
         present = layout.present.ravel()
         ratio = np.zeros(layout.n_cells)
         known = np.flatnonzero(present & np.isfinite(self.level))

@@ -116,7 +116,6 @@ def p_floor_of(n_events: int) -> float:
 def contact_events(recording: NDArray[np.float64], scale: Scale) -> tuple[ContactEvent, ...]:
     """Return the contact events of a recording ``[T, D]`` of the whole skin."""
     events = EventLog()
-    none = np.zeros(recording.shape[1], bool)
     for frames, numbers, runs in segments(recording, scale):
-        events = events.extend(scale.root_load(frames), numbers, scale.root_near, runs.start, none)
+        events = events.extend(scale.root_load(frames), numbers, scale.root_near, runs.start)
     return events.kept

@@ -82,7 +82,7 @@ class NearestNeighbours:
             always[:, cells] = found.always
             mean[:, cells] = found.mean
             spread[cells] = found.spread
-        return Prediction(never, always, mean, spread, own=False)
+        return Prediction(never, always, mean, spread)
 
     def _predict(
         self, known: NDArray[np.float64], scored: NDArray[np.float64], usable: NDArray[np.bool_]
@@ -125,7 +125,6 @@ class NearestNeighbours:
             always=share(near[..., 3] == 1, targets[:, 3] == 1),
             mean=near[..., 1].mean(axis=1)[which],
             spread=np.full(scored.shape[1], spread),
-            own=False,
         )
 
 

@@ -24,14 +24,12 @@ class Prediction:
         always: float ``[n, D]``, P(loaded throughout).
         mean: float ``[n, D]``, expected mean root load, 0 to 1.
         spread: float ``[D]``, scale of the Student t error of ``mean``; NaN: unknown.
-        own: whether it is specific to each cell, not to any cell with the same surroundings.
     """
 
     never: NDArray[np.float64]
     always: NDArray[np.float64]
     mean: NDArray[np.float64]
     spread: NDArray[np.float64]
-    own: bool = True
 
     def on(
         self, excerpts: NDArray[np.bool_] | slice, cells: NDArray[np.intp] | slice = slice(None)
@@ -40,7 +38,7 @@ class Prediction:
         never, always, mean = (
             values[excerpts][:, cells] for values in (self.never, self.always, self.mean)
         )
-        return Prediction(never, always, mean, self.spread[cells], self.own)
+        return Prediction(never, always, mean, self.spread[cells])
 
     def within(
         self,

@@ -52,7 +52,7 @@ def find_reference_faults(
     candidates = _enclosed_groups(still, layout)
     if not candidates.any() or still[present].mean() > MAJORITY:
         return np.zeros(layout.n_cells)
-    rest = baseline(recordings, present & ~still, tolerance, layout.full_scale).highest
+    rest = baseline(recordings, present & ~still, tolerance, layout.full_scale)
     typical = rest[present & ~still]
     # A cell that holds more than any baseline is loaded, or dead.
     rest = np.where(rest > typical.max(), np.median(typical), rest)

@@ -106,10 +106,9 @@ class ReferenceEvents:
         seen: list[list[ReferenceEvent]] = [[] for _ in every]
         for i, recording in enumerate(readings):
             events = TiledEvents.begin(every)
-            none = np.zeros(layout.n_cells, bool)
             for frames, numbers, runs in segments(recording, scale):
                 events = events.extend(
-                    scale.root_load(frames), numbers, scale.root_near, runs.start, none
+                    scale.root_load(frames), numbers, scale.root_near, runs.start
                 )
             for k, of_tile in events.kept():
                 again = (count_repeats(of_tile.kept) > 0).tolist()

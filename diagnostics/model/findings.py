@@ -2,16 +2,24 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import expit
 
+from diagnostics.decision.address_aliasing import find_aliasing
 from diagnostics.decision.calibration import faulty_at
+from diagnostics.decision.judged import Judged
 from diagnostics.decision.root_causes import OF_WIRES, REFUTED_KINDS, CellFindings
+from diagnostics.evidence.cold_start import typical_reading
 from diagnostics.evidence.stream_state import StreamState
 from diagnostics.faults import FaultKind
-from diagnostics.model.judge import HELD, Judgement
+from diagnostics.layout import SensorLayout
+from diagnostics.model.judge import HELD, Judgement, Model
+from diagnostics.model.objects import judged_with_objects
 from diagnostics.model.record import Mask
+from diagnostics.model.symbols import NOTHING
 from diagnostics.model.ways import DRIFTS, WAYS
 from diagnostics.model.ways.comes_and_goes import COMES_AND_GOES
 from diagnostics.preprocessing.levels import CERTAIN_RATIO, DOUBTED, RARE
@@ -20,6 +28,49 @@ _SHOWN = 1.0  # evidence that excludes a way to fail, or suggests one
 _NO_READING = (FaultKind.LATE, FaultKind.COPY, FaultKind.WEAK)  # but frames, a cell, a gain
 
 Floats = NDArray[np.float64]
+
+
+def judged_by_model(
+    model: Model, stream: StreamState, layout: SensorLayout, rate: float, full_scale: float
+) -> Judged:
+    """Return what the model says of the log behind a ``stream``.
+
+    Args:
+        model: of the array.
+        stream: the log.
+        layout: of its cells.
+        rate: expected share of healthy cells among those that are faulty.
+        full_scale: of a reading.
+    """
+    log = model.log_of_record(stream.record())
+    if stream.crosstalk is not None:
+        log.disturbed[:] = True
+    aliases, _ = find_aliasing(stream, partial(model.log_likelihood, log))
+    # what a pad shares looks alike on lines that nothing touches
+    touched = (log.load > NOTHING).any(axis=0)
+    loaded = touched & ~log.disturbed
+    # lines of one cell each: which of the two is the copy is told by the model
+    aliases = [
+        fault for fault in aliases if loaded[list(fault.cells)].any() and len(fault.cells) > 2
+    ]
+    misread = np.zeros(len(loaded), bool)
+    misread[[cell for fault in aliases for cell in fault.cells]] = True
+    judgement, still = judged_with_objects(model, log, layout, misread)
+    found = findings(judgement, stream, full_scale, rate)
+    follows = shown(judgement) & (found.probability < DOUBTED)
+    return Judged(
+        found=found,
+        aliases=aliases,
+        shown=follows & touched & stream.touched & model.living,
+        evidence={
+            "spatial": found.weight,
+            "temporal": np.zeros(len(found.weight)),
+            "events": found.events.astype(np.float64),
+        },
+        still=still,
+        contradicting=float(judgement.disturbed[model.present].mean()),
+        pulled=partial(model.lines.pulled, judgement.observed),
+    )
 
 
 def findings(
@@ -40,7 +91,9 @@ def findings(
     silent = stream.silent & present
     delivers = log.received & ~silent
     probability = np.where(delivers, judgement.probability, np.where(silent, 1.0, 0.0))
-    faulty = np.asarray(faulty_at(np.where(silent, 0.0, probability), rate) & delivers)
+    # how many others are faulty makes none faulty that shows no more than a healthy one
+    faulty = faulty_at(np.where(silent, 0.0, probability), rate) & (judgement.log_odds > 0)
+    faulty &= delivers
     # dead in the reference already, and has not moved since
     known = delivers & (stream.reference.dead > 0) & ~stream.runs.moved
     probability[known] = stream.reference.dead[known]
@@ -72,7 +125,8 @@ def findings(
     value = log.value.astype(np.float64)
     # what never left its rest agrees with a broken line, whatever is likeliest of it
     drifts = by_pieces & (way == WAYS.index(DRIFTS))
-    holds = delivers & (faulty | (log.run >= HELD)) & (refuted < 0) & ~by_frames & ~drifts
+    to_end = log.run >= min(HELD, len(log.record))
+    holds = delivers & (faulty | to_end) & (refuted < 0) & ~by_frames & ~drifts
     # where a cell rests that was dead already, the reference does not show
     level = np.where(stream.reference.dead > 0, stream.reference.scale.baseline, rest.level)
     # below its rest a cell is cut off as well
@@ -88,6 +142,7 @@ def findings(
     weak = refuted == REFUTED_KINDS.index(FaultKind.WEAK)
     gain = np.where(weak, told, np.nan)
     reads_more = gain > 1
+    typical = typical_reading(stream)
     return CellFindings(
         faulty=faulty,
         # how many others are faulty makes no wire of those that move
@@ -118,7 +173,7 @@ def findings(
         of_wire=failing.probability,
         share=failing.share,
         as_one=failing.as_one,
-        typical=reading,
+        typical=np.where(np.abs(typical - reading) <= 2 * log.symbols.tolerance, typical, reading),
     )
 
 
@@ -136,8 +191,10 @@ def _weight(judgement: Judgement, holds: Mask) -> Floats:
     (bool) by that alone."""
     of_holding = judgement.evidence[[way.kind is None for way in WAYS]].max(axis=0)
     weight = np.where(holds, of_holding, judgement.log_odds).astype(np.float64)
-    # where a cell rests that never moved in the reference tells nothing
-    return np.where(judgement.observed.log.living, weight, np.minimum(weight, 0.0))
+    # where a cell rests that never moved in the reference, or that nothing touches, tells nothing
+    observed = judgement.observed
+    tells = observed.log.living & ~observed.unwitnessed.all(axis=0)
+    return np.where(tells, weight, np.minimum(weight, 0.0))
 
 
 def _kinds() -> NDArray[np.intp]:

@@ -302,9 +302,9 @@ class Model:
         take long are asked at the end."""
         if healthy is not None:
             return self.observed(log, log.received & self.living & healthy & ~out)
-        holds = (log.run >= HELD) & (log.load[-1] > NOTHING)
         stays = ~(log.received & self.living) | out
-        observed = self.observed(log, self.moving(log) & ~out)
+        moving = self.moving(log)
+        observed = self.observed(log, moving & ~out)
         for _ in range(_ROUNDS):
             known = observed.known
             units = Units.of(observed, self.odd)
@@ -314,7 +314,7 @@ class Model:
                 observed = self.observed(log, known & ~self._worst(suspect, known, of_all))
                 continue
             # a cell that a worse one of its pad had made look wrong comes back, but once only
-            misled = ~holds & ~self._worst_of_pad(~known, of_all)
+            misled = moving & ~self._worst_of_pad(~known, of_all)
             joins = ~known & ~stays & ((evidence < 0) | misled)
             if joins.any():
                 stays |= joins

@@ -11,9 +11,11 @@ are alike, and healthy lines are odd in some recordings: either side errs in a s
 that a fault shows in several. The worst line is left out of what the others say, and those are
 tested again.
 
-Not detected: a line with fewer than three cells that move, or without others that tell of its load;
-one whose cells keep a load or another rest while it is away. A line that breaks once and for all is
-found by the values that its cells hold.
+That nothing touches a pad is no surprise: cells of others tell of no line.
+
+Not detected: a line with fewer than three cells that move, or without others on its pad that tell
+of its load; one whose cells keep a load or another rest while it is away. A line that breaks once
+and for all is found by the values that its cells hold.
 """
 
 from __future__ import annotations
@@ -130,6 +132,7 @@ class Lines:
     Attributes:
         on: bool ``[W, D]``, living cells on each.
         beside: bool ``[W, D]``, cells beside these that are not.
+        others: bool ``[W, D]``, all other living cells of its pads.
         predicted: expected loads between levels.
         resting: P(at rest | context) ``[1, W, M]``; while the model is fitted ``[halves, W, M]``,
             without each half of the recordings.
@@ -141,6 +144,7 @@ class Lines:
 
     on: Mask
     beside: Mask
+    others: Mask
     predicted: Array
     resting: Array
     half: Cells
@@ -176,10 +180,10 @@ class Lines:
         return found
 
     def told(self, load: Array, known: Mask) -> Mask:
-        """Return where a known cell off a line is loaded, bool ``[n, W]``: else what is loaded is
-        the line itself."""
-        off = (~self.on & known).astype(np.float32)
-        found: Mask = (load > NOTHING).astype(np.float32) @ off.T > 0
+        """Return where a known cell beside those of a line is loaded on its pads, bool ``[n, W]``:
+        else what is loaded is the line itself, or nothing touches it."""
+        others = (self.others & known).astype(np.float32)
+        found: Mask = (load > NOTHING).astype(np.float32) @ others.T > 0
         return found
 
     def ratio(self, observed: Observed, known: Mask, eligible: Mask) -> tuple[Array, Cells]:
@@ -339,11 +343,14 @@ def fit_lines(
     """
     on = cells_on(layout, living)
     beside = np.zeros_like(on)
+    others = np.zeros_like(on)
     for k, of in enumerate(on):
         beside[k] = layout.with_neighbours(of) & living & ~of
+        others[k] = np.isin(layout.pad_of, layout.pad_of[of]) & living & ~of
     odd = np.full(len(on), _RARELY, np.float32)
     zero = np.zeros(len(on), np.float32)
-    blank = Lines(on, beside, zero, np.zeros((1, len(on), 0), np.float32), NO_HALF, odd, zero, 1)
+    table = np.zeros((1, len(on), 0), np.float32)
+    blank = Lines(on, beside, others, zero, table, NO_HALF, odd, zero, 1)
     means = blank.means(load, on)
     rests = means <= NOTHING
     expected = np.zeros(means.shape)

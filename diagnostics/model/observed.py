@@ -36,6 +36,7 @@ class Log:
         received: bool ``[D]``, cells that deliver readings.
         far: bool ``[D]``, those that move by more than a dither.
         above: readings above rest ``[n, D]``, without what the pad shares.
+        sunk: bool ``[n, D]``, where the pad has sunk so far that a cell rests at 0, without noise.
         disturbed: bool ``[D]``, cells of pads that share what the reference never saw: an offset, a
             drift, noise, coarse steps, or a top that loads reach.
         saturated: whether any load may read as the top.
@@ -62,6 +63,7 @@ class Log:
         telling = living & self.received
         shared = rest.shared(record, telling)
         self.above = rest.above(record, shared.offset)
+        self.sunk: Mask = (shared.offset < 0) & (rest.level + shared.offset <= rest.near)
         noise = rest.noise_of(record, self.above, telling)
         unsure, self.step = rest.unsure(record, noise, shared.drift, telling)
         wider = unsure > rest.near
@@ -211,6 +213,7 @@ class Observed:
         if log.saturated:
             tells &= log.level != log.symbols.top
         tells &= ~self.stays | (log.level == 0)
+        tells &= ~log.sunk
         found: Array = np.where(tells, ratio, 0).astype(np.float32)
         return found
 

@@ -28,7 +28,6 @@ _MOST = 40.0  # log ratio whose exponential is taken
 _FAILS = 0.05  # of the units, P(a fault that comes and goes comes)
 _RECOVERS = 0.15
 _FREEDOM = 3.0  # evidence that a fault that comes and goes gains by its freedom
-_DENIES = 0.5  # of the evidence before, by which a fault has gone
 
 
 @dataclass(frozen=True)
@@ -117,15 +116,13 @@ def for_good(ratio: Array, units: Units) -> Array:
 
 def _unless_gone(evidence: Array, of_units: Array, goes: float) -> Array:
     """Return the evidence ``[D]`` of a fault that lasts: no more than what the log says since the
-    likeliest end of it, where that denies it: half as much as the fault was told by."""
+    likeliest end of it, where that denies it."""
     from_here = _from_here(of_units)
     begins = from_here.argmax(axis=0)
     sums = np.cumsum(of_units, axis=0)
     shown = np.arange(len(sums))[:, None] >= begins
     since = sums[-1] - np.where(shown, sums, -np.inf).max(axis=0)
-    told = from_here.max(axis=0) - since
-    gone = since < -np.maximum(goes, _DENIES * told)
-    found: Array = np.where(gone, np.minimum(evidence, since), evidence)
+    found: Array = np.where(since < -goes, np.minimum(evidence, since), evidence)
     return found
 
 

@@ -214,6 +214,10 @@ class Recorder:
     longest: float = np.inf
     age: int = 0
 
+    def __len__(self) -> int:
+        """Return the number of pieces."""
+        return sum(map(len, self.complete)) + (0 if self.last is None else len(self.last))
+
     def extend(
         self, frames: NDArray[np.floating], numbers: Cells, *, begins: Mask | None = None
     ) -> Recorder:

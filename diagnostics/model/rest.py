@@ -122,7 +122,9 @@ class Rest:
         found = np.zeros(record.mean.shape, np.float32)
         above = record.mean - self.level - drift
         stuck = self._stuck(record, above)
+        # at either end of the converter a reading tells no offset
         at_top = record.mean >= self.full * (1 - DITHER)
+        at_end = at_top | ((record.high <= 0) & (self.level > self.near))
         for pad in np.unique(self.pad).tolist():
             cells = self.pad == pad
             tell = np.flatnonzero(cells & telling & (self.share > _EVEN))
@@ -131,7 +133,7 @@ class Rest:
                 tell = live
             if len(tell) < _FEWEST:
                 continue
-            of_pad = np.sort(np.where(at_top[:, tell], np.nan, above[:, tell]), axis=1)
+            of_pad = np.sort(np.where(at_end[:, tell], np.nan, above[:, tell]), axis=1)
             noise = float(np.median(self.near[tell]))
             shared = _even(of_pad, 0.5, noise, _NOISES * noise)
             # in a contact with most of the pad, those that rest are the lowest
@@ -187,8 +189,8 @@ class Rest:
     def above(self, record: Record, offset: Array) -> Array:
         """Return how far each piece reads above the rest of the cell without the ``offset`` that
         its pad shares, ``[n, D]`` each. Cells that share less than others read more, those that
-        share more no less."""
-        above = record.mean - self.level - offset
+        share more no less; none rests below 0."""
+        above = record.mean - np.maximum(self.level + offset, 0)
         uneven = _EVEN * np.maximum(-offset, 0)
         found: Array = np.where(above < 0, np.minimum(above + uneven, 0), above)
         return found

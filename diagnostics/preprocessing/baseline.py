@@ -12,7 +12,6 @@ without trend.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,34 +19,17 @@ from scipy.special import ndtri
 
 from diagnostics.preprocessing.levels import LEAST_LOADED, LIGHT, LOW, RARE
 from diagnostics.preprocessing.quantiles import known_quantile
-from diagnostics.preprocessing.readings import CELLS, SEGMENT, RecordingBlocks, spread
+from diagnostics.preprocessing.readings import CELLS, RecordingBlocks, spread
 
 _NOISE = 6.0  # standard deviations from the low quantile to the highest of many readings
 
 Floats = NDArray[np.float64]
 
 
-class Baseline(NamedTuple):
-    """Readings without contact, in the layout's unit.
-
-    Attributes:
-        low: float ``[D]``, low quantile of the readings; 0 without any reading.
-        highest: float ``[D]``, highest reading without contact.
-        noise: standard deviation of the readings; NaN: the recordings are too short to tell.
-        last, peaks: float ``[recordings, D]``, last reading and lowest peak in each recording.
-    """
-
-    low: Floats
-    highest: Floats
-    noise: float
-    last: Floats
-    peaks: Floats
-
-
 def baseline(
     recordings: Sequence[Floats], present: NDArray[np.bool_], tolerance: float, full_scale: float
-) -> Baseline:
-    """Estimate the baseline of each cell, see the module.
+) -> Floats:
+    """Return the highest reading without contact of each cell, ``[D]``, see the module.
 
     Args:
         recordings: ``[T, D]`` each.
@@ -57,7 +39,7 @@ def baseline(
     """
     readings = RecordingBlocks.of(recordings)
     cells = spread(np.flatnonzero(present))
-    low, last, peaks = _low(readings)
+    low = _low(readings)
     offsets = []
     unloaded = []
     curvatures = []
@@ -75,13 +57,13 @@ def baseline(
             # A load changes slowly: its second difference is small.
             curvatures.append(np.median(np.abs(np.diff(whole, 2, axis=0)), axis=0))
     if not offsets:
-        return Baseline(low, low, np.nan, last, peaks)
+        return low
     offset = np.concatenate(offsets)
     light = offset < LIGHT * full_scale
     drift = _highest(offset[light], np.concatenate(unloaded)[light])
     noise = deviation(float(np.quantile(np.concatenate(curvatures), LEAST_LOADED)))
-    highest = low + max(0.0, drift + _NOISE * noise - tolerance)
-    return Baseline(low, highest, noise, last, peaks)
+    found: Floats = low + max(0.0, drift + _NOISE * noise - tolerance)
+    return found
 
 
 def _highest(offset: Floats, unloaded: Floats) -> float:
@@ -106,38 +88,15 @@ def _highest(offset: Floats, unloaded: Floats) -> float:
     return usual + float(np.clip(below, usual, 2 * usual))
 
 
-def _low(readings: RecordingBlocks) -> tuple[Floats, Floats, Floats]:
-    """Return the low quantile of the readings of each cell, and its last reading and lowest peak in
-    each recording.
-
-    Shapes: ``[D]`` (0 without any reading), and twice ``[recordings, D]``.
-    """
+def _low(readings: RecordingBlocks) -> Floats:
+    """Return the low quantile of the readings of each cell, ``[D]``; 0 without any reading."""
     n_cells = readings.given[0].shape[1]
-    low, (last, peaks) = np.zeros(n_cells), np.full((2, len(readings), n_cells), np.nan)
+    low = np.zeros(n_cells)
     for first in range(0, n_cells, CELLS):
         cells = np.arange(first, min(first + CELLS, n_cells))
         pieces = [readings.piece(i, slice(None), cells) for i in range(len(readings))]
-        for i, frames in enumerate(pieces):
-            last[i, cells] = frames[-1]
-            peaks[i, cells] = _lowest_peak(frames)
         low[cells] = np.nan_to_num(known_quantile(np.concatenate(pieces), LOW, axis=0))
-    return low, last, peaks
-
-
-def _lowest_peak(frames: Floats) -> Floats:
-    """Return the minimum over half segments of the highest reading in each, ``[D]``: that of a
-    constant run."""
-    lowest: Floats = np.fmin.reduce(half_segment_peaks(frames), axis=0)
-    return lowest
-
-
-def half_segment_peaks(frames: Floats) -> Floats:
-    """Return the highest reading of each cell in each half segment, ``[n, D]``; a shorter recording
-    is one."""
-    length = min(SEGMENT // 2, len(frames))
-    whole = len(frames) // length * length
-    peaks: Floats = np.fmax.reduce(frames[:whole].reshape(-1, length, frames.shape[1]), axis=1)
-    return peaks
+    return low
 
 
 def deviation(curvature: float) -> float:

@@ -23,10 +23,6 @@ recording r is::
 and counts if the q05 over cells, in place of q25, exceeds 5 % in half of the recordings: no contact
 loads nearly all cells throughout most recordings. Levels within a recording of the reference are
 not recognised.
-
-The supply of a pad may sag while others are loaded. Its baseline is then the lower level, and at
-the higher one all its cells seem loaded alike. The even rest of a pad is the middle of the shortest
-interval that holds half of its cells, if that is narrow.
 """
 
 from __future__ import annotations
@@ -38,13 +34,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from diagnostics.preprocessing.levels import FEWEST, LEAST_LOADED, LIGHT, LOW, MAJORITY, SLIGHT
+from diagnostics.preprocessing.levels import LEAST_LOADED, LIGHT, LOW, MAJORITY, SLIGHT
 from diagnostics.preprocessing.quantiles import known_quantile
 from diagnostics.preprocessing.readings import RecordingBlocks, spread
 from diagnostics.preprocessing.scale import usual_limit
 
 if TYPE_CHECKING:
-    from diagnostics.layout import SensorLayout
     from diagnostics.preprocessing.scale import Scale
 
 Floats = NDArray[np.float64]
@@ -211,41 +206,6 @@ def levels_above(
     above = _lows(readings, range(len(readings)), cells) - scale.baseline[cells]
     level = usual.excess([least_loaded(of_recording) for of_recording in above])
     return np.where(level < usual.limit(scale.full_scale), level, 0.0)
-
-
-def even_rests(above: Floats, pad_of: NDArray[np.intp], pads: int, near: float) -> Floats:
-    """Return what half of the cells of each pad read within ``near`` of each other in each frame,
-    ``[n, pads]``: the middle of the shortest interval; NaN where no half does.
-
-    Args:
-        above: ``[n, cells]``, readings above the baselines; a cell with NaN tells nothing.
-        pad_of: int ``[cells]``, pad of each cell.
-        pads: their number.
-        near: readings that differ by less agree.
-    """
-    found = np.full((len(above), pads), np.nan)
-    known = ~np.isnan(above).any(axis=0)
-    for pad in range(pads):
-        ordered = np.sort(above[:, known & (pad_of == pad)], axis=1)
-        half = ordered.shape[1] // 2
-        if half < FEWEST:
-            continue
-        first = ordered[:, : ordered.shape[1] - half]
-        width = ordered[:, half:] - first
-        shortest = width.argmin(axis=1)[:, None]
-        span = np.take_along_axis(width, shortest, axis=1)[:, 0]
-        begin = np.take_along_axis(first, shortest, axis=1)[:, 0]
-        found[:, pad] = np.where(span <= near, begin + span / 2, np.nan)
-    return found
-
-
-def highest_rests(recordings: Sequence[Floats], scale: Scale, layout: SensorLayout) -> Floats:
-    """Return the highest even rest of each pad in recordings ``[T, D]``, ``[pads]``; 0 without
-    any."""
-    cells = spread(np.flatnonzero(layout.present))
-    above = RecordingBlocks.of(recordings).thinned(cells) - scale.baseline[cells]
-    rests = even_rests(above, layout.pad_of[cells], layout.pads, scale.near)
-    return np.nan_to_num(known_quantile(rests, 1 - LOW, axis=0)).clip(0.0, None)
 
 
 def _lows(readings: RecordingBlocks, which: range, cells: NDArray[np.intp]) -> Floats:

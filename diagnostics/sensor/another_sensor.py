@@ -31,8 +31,8 @@ from scipy.linalg import eigh
 from scipy.stats import median_abs_deviation
 from sklearn.covariance import ledoit_wolf
 
-from diagnostics.evidence.drift import GAIN
 from diagnostics.preprocessing.levels import CERTAIN_RATIO, FEWEST, LIGHT, MAJORITY, SLIGHT
+from diagnostics.sensor.gain import GAIN
 from diagnostics.sensor.recalibration import (
     Fit,
     common_spread,

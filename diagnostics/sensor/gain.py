@@ -19,10 +19,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from diagnostics.evidence.drift import GAIN
 from diagnostics.preprocessing.levels import LOW, MAJORITY
 from diagnostics.preprocessing.quantiles import known_quantile
 
+GAIN = 1.3  # up or down: a smaller change is no fault
 _FEWEST = 5  # recordings, of the log and of the reference
 # shares of the loaded sizes that are larger: less loaded ones are noise, the largest saturate
 _LOADED = np.linspace(0.02, 0.5, 25)

@@ -35,11 +35,11 @@ from numpy.typing import NDArray
 from scipy.special import ndtri
 from scipy.stats import chi2
 
-from diagnostics.evidence.drift import FEWEST_EVENTS, GAIN
 from diagnostics.healthy.model import contact_events
 from diagnostics.healthy.prediction import OUTLIERS, log_student_t
 from diagnostics.preprocessing.levels import FEWEST, LOW, MARGIN, SLIGHT
 from diagnostics.preprocessing.readings import held
+from diagnostics.sensor.gain import GAIN
 
 if TYPE_CHECKING:
     from diagnostics.evidence.reference import Reference
@@ -48,6 +48,7 @@ if TYPE_CHECKING:
     from diagnostics.preprocessing.scale import Array
 
 _FEWEST = 12  # recordings
+_FEWEST_EVENTS = 3  # of a cell: fewer prove no gain
 _ERRORS = 4.0  # standard errors of the gain in pseudo-likelihood
 # of the correction; share of each correction that is applied: neighbours err together
 _ROUNDS = 4
@@ -393,7 +394,7 @@ class Fit:
         total = np.maximum(weight.sum(axis=0), 1e-12)
         variance = np.maximum((weight * (ratio - mean) ** 2).sum(axis=0) / total, _LEAST_VARIANCE)
         variance *= (weight**2).sum(axis=0) / total**2  # 1 / effective number of events
-        few = (weight > 0).sum(axis=0) < FEWEST_EVENTS
+        few = (weight > 0).sum(axis=0) < _FEWEST_EVENTS
         return np.where(few, np.nan, mean), np.where(few, np.nan, variance)
 
 

@@ -27,11 +27,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from diagnostics.evidence.drift import GAIN
 from diagnostics.faults import FaultSet
 from diagnostics.layout import SensorLayout
 from diagnostics.preprocessing.levels import LIGHT, LOW, P_MIN
 from diagnostics.preprocessing.quantiles import known_quantile
+from diagnostics.sensor.gain import GAIN
 
 _LEAST = 5  # recordings, new and reference
 _FEW_PAIRS = 10_000  # of a new and a reference recording: a size

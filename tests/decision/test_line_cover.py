@@ -5,7 +5,6 @@ from diagnostics import Line, SensorLayout
 from diagnostics.decision import line_cover
 from diagnostics.decision.line_cover import (
     Cause,
-    candidate_groups,
     cheapest_of_few,
     cheapest_of_many,
 )
@@ -180,42 +179,6 @@ def test_one_certain_cell_lowers_the_cost_of_its_wire(certain: bool):
         None,
     )
     assert (cause is not None and cause.line is not None) == certain
-
-
-def test_candidate_groups_are_the_cells_that_one_wire_would_explain():
-    row = LAYOUT.cells_on(Line(0, "row", 3))
-    column = LAYOUT.cells_on(Line(1, "column", 2))
-    consistent = mask(row, column[4:])
-    weight = np.where(mask(row[[0, 5]], column[[6, 9]]), 3.0, NOTHING)
-    groups = candidate_groups(consistent, ~consistent, weight, LAYOUT)
-    assert [group.tolist() for group in groups] == [row.tolist(), column[4:].tolist()]
-    assert (
-        candidate_groups(
-            consistent, ~consistent, np.where(mask(row[:1], column[-1:]), 3.0, NOTHING), LAYOUT
-        )
-        == []
-    )
-
-
-def test_the_lines_of_an_address_bit_are_no_group():
-    # Without half of a pad as predictors, contacts on the other half seem to be missing there.
-    moved, _ = LAYOUT.misaddressed(Line(0, "row_address", 3), 0)
-    consistent = mask(moved)
-    # one cell each of two rows: no row is a group
-    weight = np.where(mask(moved[[0, 15]]), 3.0, NOTHING)
-    assert candidate_groups(consistent, ~consistent, weight, LAYOUT) == []
-
-
-def test_cells_of_a_pad_with_a_working_one_are_no_group():
-    consistent = mask(np.arange(110))  # a converter has no middle to be broken in
-    weight = np.where(consistent, 3.0, NOTHING)
-    pad = np.arange(110).tolist()
-    assert pad in [group.tolist() for group in candidate_groups(consistent, mask(), weight, LAYOUT)]
-    consistent[60] = False
-    groups = [group.tolist() for group in candidate_groups(consistent, mask([60]), weight, LAYOUT)]
-    assert pad[:60] not in groups
-    assert pad[61:] not in groups
-    assert max(len(group) for group in groups) == 11  # no more than a column
 
 
 def test_a_few_uncertain_cells_do_not_prove_a_broken_wire():

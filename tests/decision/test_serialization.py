@@ -59,7 +59,7 @@ def test_one_without_a_reference_does_too(grasps, log):
 def test_frame_by_frame_it_gives_the_same_result(fitted, log):
     was = Monitor(fitted)
     restored = Monitor(stored(fitted))
-    news = [(was.update(frame), restored.update(frame)) for frame in log[:420]]
+    news = [(was.update(frame), restored.update(frame)) for frame in log[:700]]
     assert any(one for one, _ in news)
     assert all(one == other for one, other in news)
     assert restored.diagnosis().to_dict() == was.diagnosis().to_dict()
@@ -99,7 +99,10 @@ def test_the_state_is_a_copy(fitted):
     assert (fitted.reference_.model.local_regressions[0].weight == before).all()
 
 
-@pytest.mark.parametrize("array", sorted(small_fit(SensorLayout(1, 3, 3)).state()[1]))
+@pytest.mark.parametrize(
+    "array",
+    sorted(name for name, a in small_fit(SensorLayout(1, 3, 3)).state()[1].items() if a.size),
+)
 def test_an_array_that_is_missing_misshapen_or_not_finite_is_refused_by_name(array):
     about, arrays = small_fit(SensorLayout(1, 3, 3)).state()
     without = {name: value for name, value in arrays.items() if name != array}
@@ -118,12 +121,10 @@ def test_an_array_that_is_missing_misshapen_or_not_finite_is_refused_by_name(arr
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
-        ({"schema": "adaptfault.diagnoser/1"}, "schema"),
+        ({"schema": "adaptfault.diagnoser/2"}, "schema"),
         ({"layout": {"rows": 3}}, "pads"),
         ({"layout": None}, "damaged"),
         ({"false_discovery_rate": None}, "damaged"),
-        ({"calibrator": {}}, "offset"),
-        ({"calibrator": 3}, "calibrator"),
         ({"reference": {}}, "missing"),
         ({"reference": 3}, "damaged"),
     ],

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from conftest import without_calibration
+from conftest import rough_fit
 
 from diagnostics import Diagnosis, FaultKind, Line, Monitor, SelfDiagnosis, SensorLayout, StaticLoad
 
@@ -35,7 +35,7 @@ def recordings(count: int, seed: int) -> list[np.ndarray]:
 
 @pytest.fixture(scope="module")
 def fitted() -> SelfDiagnosis:
-    with without_calibration():
+    with rough_fit():
         return SelfDiagnosis(TAXELS).fit(recordings(40, 0))
 
 

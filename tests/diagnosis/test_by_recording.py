@@ -22,7 +22,7 @@ ROW = [LAYOUT.cell(0, 3, column) for column in range(8)]
 STUCK = LAYOUT.cell(0, 5, 4)
 DEAD = sorted([*ROW, STUCK])
 MIDDLE = tuple(range(14, 28))
-pytestmark = pytest.mark.usefixtures("uncalibrated")
+pytestmark = pytest.mark.usefixtures("roughly_fitted")
 
 
 @pytest.fixture(scope="module")
@@ -44,9 +44,9 @@ def seated_again(grasps: list[np.ndarray]) -> list[np.ndarray]:
 
 @pytest.fixture(scope="module")
 def diagnosis(seated_again: list[np.ndarray]) -> Diagnosis:
-    from conftest import without_calibration
+    from conftest import rough_fit
 
-    with without_calibration():
+    with rough_fit():
         return SelfDiagnosis(LAYOUT).diagnose(seated_again)
 
 

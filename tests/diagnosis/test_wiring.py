@@ -2,7 +2,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from conftest import without_calibration
+from conftest import rough_fit
 
 from adaptfault.data.simulated_grasps import simulate
 from adaptfault.robot.ros_diagnostics import diagnostic_array, stale_array
@@ -181,7 +181,7 @@ def grasps() -> list[np.ndarray]:
 
 @pytest.fixture(scope="module")
 def fitted(grasps: list[np.ndarray]) -> SelfDiagnosis:
-    with without_calibration():
+    with rough_fit():
         return SelfDiagnosis(WIRED).fit(grasps[::2])
 
 

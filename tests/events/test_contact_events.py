@@ -26,18 +26,15 @@ def idle(frames: int) -> np.ndarray:
     return np.zeros((frames, CELLS))
 
 
-def events_of(log: np.ndarray, size: int = 32, stuck: tuple[int, ...] = ()) -> EventLog:
-    """Return the events of a log; ``stuck`` cells are known to have jumped to their value."""
+def events_of(log: np.ndarray, size: int = 32) -> EventLog:
+    """Return the events of a log."""
     events = EventLog()
     runs = ConstantRuns.begin(log.shape[1])
-    jumped = np.isin(np.arange(log.shape[1]), stuck)
     for first in range(0, len(log), size):
         frames = log[first : first + size]
         numbers = np.arange(first, first + len(frames))
         runs = runs.extend(frames, numbers, 0.025)
-        events = events.extend(
-            SCALE.root_load(frames), numbers, SCALE.root_near, runs.start, jumped
-        )
+        events = events.extend(SCALE.root_load(frames), numbers, SCALE.root_near, runs.start)
     return events
 
 
@@ -112,18 +109,6 @@ def test_what_is_held_since_a_slow_change_of_posture_has_not_outlasted_the_event
     assert events[1].since <= end
 
 
-@pytest.mark.parametrize("onset", [33, 50, 63, 70])
-@pytest.mark.parametrize("value", [0.0, 5.0])
-def test_cells_that_break_within_an_event_can_be_tested_on_the_rest_of_it(onset: int, value: float):
-    broken = (3, 4, 5)
-    log = np.concatenate([idle(10), held(100), idle(20)])
-    log[onset:, broken] = value
-    found = events_of(log, stuck=broken)
-    (event,) = (t for t in found.kept if t.first <= onset < t.end)
-    (rest,) = (part for part in event.suffixes() if part.first == onset)
-    assert (rest.features()[3, list(broken)] == (value > 0)).all()  # at that value all through
-
-
 @pytest.mark.parametrize("onset", range(1, 18, 4))
 def test_cells_that_break_all_at_once_do_not_hide_the_short_contacts_after(onset: int):
     light = 0.2 * HAND * [1, 1, 1, 1, 1, 0, 0, 0, 0, 0, 0, 0]
@@ -139,15 +124,6 @@ def test_cells_that_blink_at_the_edge_of_a_contact_begin_no_event():
     usual = [t.first for t in events_of(log).kept]
     log[80:, 8:] = np.random.default_rng(1).choice([0.0, 0.07], (len(log) - 80, 4))
     assert [t.first for t in events_of(log).kept] == usual
-
-
-def test_cells_that_jump_to_full_scale_within_an_event_do_not_hide_its_end():
-    light = HAND * [1, 1, 0.5, 0.3, 0, 0, 0, 0, 0, 0, 0, 0]
-    broken = (5, 6, 7, 8, 9, 10, 11)
-    log = np.concatenate([part for _ in range(4) for part in (held(50, light), idle(20))])
-    usual = events_of(log).kept
-    log[30:, broken] = 5.0
-    assert len(events_of(log, stuck=broken).kept) == len(usual) > len(events_of(log).kept)
 
 
 @pytest.mark.parametrize("broken", [(0,), (0, 1), (0, 1, 9, 10)])

@@ -2,7 +2,7 @@ import tracemalloc
 
 import numpy as np
 import pytest
-from conftest import without_calibration
+from conftest import rough_fit
 
 from diagnostics import (
     Fault,
@@ -52,7 +52,7 @@ def log(
 
 @pytest.fixture(scope="module")
 def fitted() -> SelfDiagnosis:
-    with without_calibration():
+    with rough_fit():
         return SelfDiagnosis(SKIN).fit([log(SKIN, 199, seed) for seed in range(7)])
 
 
@@ -72,21 +72,6 @@ def test_each_cell_is_an_output_of_one_tile_with_all_cells_near_it_on_its_pad_as
             assert set(np.flatnonzero(block & present).tolist()) <= near
 
 
-def test_a_row_across_several_tiles_is_excluded_from_the_predictors_as_a_group(fitted):
-    row = SKIN.cells_on(Line(0, "row", 11))
-    stream = fitted.stream()
-    stream.extend(
-        inject(log(SKIN, 100, 40), [line_fault(SKIN, Line(0, "row", 11), FaultKind.OPEN)], SKIN)
-    )
-    stream = stream.complete()
-    spatial = stream.spatial()
-    none = np.zeros(SKIN.n_cells, bool)
-    of_row, of_one = stream.each_excluded(spatial, none, [row, row[:1]])
-    assert len({i for i, tile in enumerate(tiles(SKIN)) if np.isin(row, tile.outputs).any()}) > 1
-    assert of_row[row].sum() > spatial.surprisal[row].sum() + 3
-    assert of_one[row[0]] == pytest.approx(spatial.surprisal[row[0]], abs=0.5)
-
-
 def test_an_array_of_a_few_hundred_cells_is_one_tile():
     assert len(tiles(SensorLayout.paper())) == 1
     assert len(tiles(SensorLayout(2, 13, 6))) == 1
@@ -101,8 +86,7 @@ def test_a_tile_in_which_nothing_moves_is_not_processed():
     frames[:, ~still] = np.linspace(0, 2, 32)[:, None]
     scale = Scale(np.zeros(SKIN.n_cells), 0.05, 5.0)
     start = np.where(still, 0, 31)
-    none = np.zeros_like(still)
-    after = events.extend(scale.root_load(frames), numbers, scale.root_near, start, none)
+    after = events.extend(scale.root_load(frames), numbers, scale.root_near, start)
     changed = {i for i, tile in enumerate(events.tiles) if not still[tile.inputs].all()}
     assert {
         i for i, (a, b) in enumerate(zip(events.of, after.of, strict=True)) if a is not b
@@ -162,23 +146,22 @@ def test_monitor_and_diagnosis_agree(fitted):
     assert monitor.diagnosis().to_dict() == fitted.diagnose(frames).to_dict()
 
 
-@pytest.mark.parametrize(("reference", "evidence"), [(True, 3.0), (False, 1.0)])
-def test_dropped_events_leave_their_evidence(fitted, monkeypatch, reference: bool, evidence: float):
-    monkeypatch.setattr("diagnostics.evidence.stream_state.MAX_EVENTS", 3)
-    monkeypatch.setattr("diagnostics.evidence.stream_state.KEPT_EVENTS", 2)
-    diagnosis = fitted if reference else SelfDiagnosis(SKIN)
+def test_dropped_events_leave_their_evidence(monkeypatch):
+    monkeypatch.setattr("diagnostics.evidence.cold_start.MAX_EVENTS", 3)
+    monkeypatch.setattr("diagnostics.evidence.cold_start.KEPT_EVENTS", 2)
+    diagnosis = SelfDiagnosis(SKIN)
     healthy = log(SKIN, 600, 90)
     stream = diagnosis.stream()
     dead = np.argsort((healthy > 0.5).sum(axis=0))[[-1, -100, -200]]  # often loaded
     frames = inject(healthy, [Fault(FaultKind.OPEN, (int(cell),)) for cell in dead], SKIN)
     stream.extend(frames)
-    assert max(len(events.kept) for events in stream.local.of) <= 5
-    assert stream.accumulated[dead].min() > evidence
+    assert max(len(events.kept) for events in stream.cold.events.of) <= 5
+    assert stream.cold.accumulated[dead].min() > 1
     frame_by_frame = diagnosis.stream()
     for frame in frames:
         frame_by_frame.extend(frame[None])
     np.testing.assert_array_equal(
-        frame_by_frame.complete().accumulated, stream.complete().accumulated
+        frame_by_frame.complete().cold.accumulated, stream.complete().cold.accumulated
     )
 
 

@@ -8,15 +8,13 @@ TOLERANCE = 0.02
 FULL_SCALE = 5.0
 
 
-def runs_of(log: np.ndarray, *sizes: int, baseline: np.ndarray | float = 0.0) -> ConstantRuns:
+def runs_of(log: np.ndarray, *sizes: int) -> ConstantRuns:
     """Feed ``log`` in chunks of the sizes, the rest in one."""
     runs = ConstantRuns.begin(log.shape[1])
     first = 0
     for size in (*sizes, len(log) - sum(sizes)):
         if size:
-            runs = runs.extend(
-                log[first : first + size], np.arange(first, first + size), TOLERANCE, baseline
-            )
+            runs = runs.extend(log[first : first + size], np.arange(first, first + size), TOLERANCE)
         first += size
     return runs
 
@@ -44,7 +42,6 @@ def test_a_cell_that_never_moved_starts_at_frame_0():
     assert runs.start.tolist() == [0, 30]
     assert runs.moved.tolist() == [False, True]
     assert runs.length.tolist() == [40, 10]
-    assert runs.jump.tolist() == [0, 3]
 
 
 def test_a_missing_reading_neither_ends_nor_extends_a_run():
@@ -56,12 +53,11 @@ def test_a_missing_reading_neither_ends_nor_extends_a_run():
     assert runs.last[[0, 2]].tolist() == [1, 2]
 
 
-def test_a_run_starts_with_a_reading_and_the_jump_into_it_spans_a_gap():
+def test_a_run_starts_with_a_reading():
     log = np.array([[3, 3], [3, np.nan], [np.nan, np.nan], [0, 3], [np.nan, 3], [0, 0]])
     for size in range(1, 6):
         runs = runs_of(log, size)
         assert runs.start.tolist() == [3, 5]
-        assert runs.jump.tolist() == [-3, -3]
 
 
 def test_how_long_a_cell_has_been_silent_is_counted_over_blocks():
@@ -106,40 +102,8 @@ def test_runs_are_the_same_however_the_frames_come_in(sizes: tuple[int, ...]):
     log = steps(np.random.default_rng(1), 60, 30)
     at_once = runs_of(log)
     in_parts = runs_of(log, *sizes)
-    for name in ("start", "length", "low", "high", "jump", "last"):
+    for name in ("start", "length", "low", "high", "last"):
         np.testing.assert_array_equal(getattr(in_parts, name), getattr(at_once, name), err_msg=name)
-
-
-def test_a_jump_alone_has_no_company_and_the_release_of_a_grasp_has():
-    alone = np.tile(np.linspace(1, 2, 20)[:, None], 10)
-    alone[12:, 3] = 5.0
-    released = np.tile(np.linspace(1, 2, 20)[:, None], 10)
-    released[12:] = 0.0
-    assert runs_of(alone).company[3] < 0.2
-    assert runs_of(released).company.min() > 0.8
-
-
-def test_a_jump_while_the_others_hold_a_load_still_has_no_company():
-    log = np.concatenate([np.zeros((20, 10)), np.ones((200, 10))])
-    log[150:, 3] = 5.0
-    assert runs_of(log, 32, 32, 32, 32, 32).company[3] < 0.2
-
-
-@pytest.mark.parametrize("rest", [0.0, 0.15, 0.6])
-def test_cells_that_rest_are_not_loaded_wherever_they_rest(rest: float):
-    baseline = np.full(40, rest)
-    log = np.tile(baseline, (20, 1))
-    log[:12, :10] += np.linspace(1, 2, 12)[:, None]
-    assert runs_of(log, baseline=baseline).company[:10].tolist() == [1.0] * 10
-
-
-def test_cells_that_rise_are_no_company_for_one_that_falls():
-    log = np.tile(np.linspace(1, 2, 20)[:, None], 10)
-    # many break at once
-    log[12:, 0] = 0.0
-    log[12:, 1:6] = FULL_SCALE
-    company = runs_of(log).company
-    assert company[:6] == pytest.approx([0.1] + [0.5] * 5)
 
 
 def test_how_long_a_cell_has_read_the_same_is_counted_over_blocks_and_gaps():

@@ -14,7 +14,6 @@ from scipy.stats import betabinom
 from diagnostics import Fault, FaultKind, SelfDiagnosis, inject
 from diagnostics.events.constant_runs import ConstantRuns
 from diagnostics.evidence.rest_level import RestLevel, beta_binomial
-from diagnostics.evidence.term import ConstantCells
 
 TOLERANCE = 0.005
 STEP = 1 / 1023
@@ -30,7 +29,7 @@ def resting(readings: np.ndarray, asked: np.ndarray) -> np.ndarray:
     moved = np.where(asked, readings[-1], readings[-1] + 0.5 + 0.1 * np.arange(8)[:, None])
     after = runs.extend(moved, len(numbers) + np.arange(8), TOLERANCE)
     level = RestLevel.begin(CELLS).extend(runs, after.start != runs.start)
-    return level.evidence(ConstantCells(LAYOUT, LAYOUT.full_scale, TOLERANCE, after, asked))[asked]
+    return level.evidence(after, asked, TOLERANCE, LAYOUT)[asked]
 
 
 def test_healthy_cells_have_a_mean_likelihood_ratio_of_at_most_1():

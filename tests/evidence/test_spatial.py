@@ -3,8 +3,8 @@ import pytest
 
 from diagnostics.events.constant_runs import ConstantRuns
 from diagnostics.events.contact_events import ContactEvent, Summary
-from diagnostics.evidence.conditional_test import CellState, ConditionalTest, Model
-from diagnostics.evidence.spatial import Exclusion, Spatial, SpatialTest
+from diagnostics.evidence.conditional_test import CellState, Model
+from diagnostics.evidence.spatial import Spatial, SpatialTest
 from diagnostics.healthy.prediction import Prediction
 from diagnostics.preprocessing.scale import Array, Scale
 
@@ -85,7 +85,7 @@ def result_of(
     accumulated = np.zeros(CELLS) if accumulated is None else accumulated
     jumps = np.full(CELLS, jump)
     cells = CellState(runs, SCALE, 0.025, accumulated, jumps, ~wrong)
-    return SpatialTest(events, cells, model or Copycat().predict, Exclusion(2.0)).finish()
+    return SpatialTest(events, cells, model or Copycat().predict).finish()
 
 
 def pressed(events: int) -> np.ndarray:
@@ -157,22 +157,6 @@ def test_cells_that_move_are_not_scored_and_have_no_evidence():
     assert (spatial.evidence[~spatial.scored] == 0).all()
     assert spatial.events[3] == 4
     assert spatial.events[~spatial.scored].sum() == 0
-
-
-def test_cells_that_broke_together_do_not_vouch_for_each_other():
-    log = pressed(1)
-    log[:, 5:] = 0
-    assert (result_of(log, model=Row().predict).surprisal[5:] < 0.1).all()
-    runs, events = seen(log)
-    zero = np.zeros(CELLS)
-    test = ConditionalTest.of(
-        events, CellState(runs, SCALE, 0.025, zero, zero, ~NONE), Row().predict
-    )
-    together, alone = (
-        test.summed(test.score(~np.isin(np.arange(CELLS), group))[1]) for group in ([5, 6, 7], [6])
-    )
-    assert (together[5:] > 1).all()
-    assert alone[6] < 0.1  # the others of its row are predictors
 
 
 def test_only_what_came_after_the_onset_speaks_against_a_cell():
@@ -247,20 +231,3 @@ def test_an_offset_that_ended_is_forgotten():
     log[:100, 3] = 2 + 0.2 * log[:100, 3]
     log[:, 7] = 0
     assert result_of(log).offset[3] == 0
-
-
-def test_beside_a_cell_with_a_wrong_gain_no_other_is_accused():
-    log = pressed(12)
-    log[:, 3] *= 0.1
-    result = result_of(log)
-    assert np.flatnonzero(result.drifting).tolist() == [3]
-    assert result.factor[3] == 0.1
-    assert np.isnan(np.delete(result.factor, 3)).all()
-
-
-def test_a_cell_that_got_stuck_has_no_wrong_gain():
-    log = pressed(12)
-    log[60:, 3] = 0.3
-    result = result_of(log)
-    assert result.evidence[3] > 4
-    assert not result.drifting.any()

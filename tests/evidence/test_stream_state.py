@@ -15,7 +15,6 @@ from diagnostics import (
     lose_frames,
 )
 from diagnostics.evidence.reference import Reference
-from diagnostics.evidence.spatial import Exclusion
 from diagnostics.evidence.stream_state import StreamState
 from diagnostics.faults import Fault
 
@@ -42,7 +41,7 @@ def pressed(presses: int, seed: int = 0) -> np.ndarray:
 def remembered(
     log: np.ndarray, size: int | None = None, reference: Reference = UNKNOWN
 ) -> StreamState:
-    stream = StreamState(LAYOUT, reference, Exclusion(2.0))
+    stream = StreamState(LAYOUT, reference)
     for first in range(0, len(log), size or len(log)):
         stream.extend(log[first : first + (size or len(log))])
     return stream.complete()
@@ -52,14 +51,14 @@ def differences(a: StreamState, b: StreamState) -> list[str]:
     """Return the names of what two states hold differently."""
     pairs = {}
     for part, names in {
-        "runs": ("start", "length", "low", "high", "jump", "company", "last"),
+        "runs": ("start", "length", "low", "high", "last", "same"),
         "intermittency": ("blinking", "noisy", "blinks", "high", "blinks_since", "noisy_since"),
         "transport": ("seen", "lost", "first_lost", "last", "repeats"),
     }.items():
         for name in names:
             pairs[f"{part}.{name}"] = [getattr(getattr(state, part), name) for state in (a, b)]
-    for name in ("accumulated", "received"):
-        pairs[name] = [getattr(state, name) for state in (a, b)]
+    pairs["received"] = [a.received, b.received]
+    pairs["accumulated"] = [a.cold.accumulated, b.cold.accumulated]
     for kind in a.duplicates.of:
         for name in ("since", "seen_by", "coincidences", "sums"):
             pairs[f"duplicates.{kind}.{name}"] = [
@@ -69,7 +68,7 @@ def differences(a: StreamState, b: StreamState) -> list[str]:
         [(r.onset, r.frames) for r in state.transport.repetitions] for state in (a, b)
     ]
     pairs["parts"] = [
-        [[(p.first, p.n) for p in event.parts] for event in state.local.of[0].kept]
+        [[(p.first, p.n) for p in event.parts] for event in state.cold.events.of[0].kept]
         for state in (a, b)
     ]
     found = [
@@ -77,7 +76,7 @@ def differences(a: StreamState, b: StreamState) -> list[str]:
     ]
     if pairs["parts"][0] != pairs["parts"][1]:
         return [*found, "parts"]
-    events = zip(a.local.of[0].kept, b.local.of[0].kept, strict=True)
+    events = zip(a.cold.events.of[0].kept, b.cold.events.of[0].kept, strict=True)
     alike = [equal(t.whole.features(), u.whole.features()) for t, u in events]
     return found if all(alike) else [*found, "features"]
 
@@ -106,7 +105,7 @@ def test_it_is_the_same_however_the_frames_come_in(size: int):
     log = broken()
     at_once = remembered(log)
     assert differences(remembered(log, size), at_once) == []
-    assert len(at_once.local.of[0].kept) > 10
+    assert len(at_once.cold.events.of[0].kept) > 10
     assert at_once.transport.repetitions
     assert at_once.intermittency.blinks[12] > 0
 
@@ -122,16 +121,17 @@ def test_states_of_other_frames_differ():
 
 def test_looking_at_it_in_between_changes_nothing():
     log = broken()[:1800]
-    stream = StreamState(LAYOUT, UNKNOWN, Exclusion(2.0))
+    stream = StreamState(LAYOUT, UNKNOWN)
     for first in range(0, 1800, 29):
         stream.extend(log[first : first + 29])
-        stream.complete().spatial()
+        completed = stream.complete()
+        completed.cold.spatial(completed)
     assert differences(stream.complete(), remembered(log)) == []
 
 
 def test_completing_a_state_leaves_it_as_it_was():
     log = pressed(3)[:50]
-    stream = StreamState(LAYOUT, UNKNOWN, Exclusion(2.0))
+    stream = StreamState(LAYOUT, UNKNOWN)
     stream.extend(log)
     before = stream.runs
     assert stream.complete().runs.length.max() == 50
@@ -141,7 +141,7 @@ def test_completing_a_state_leaves_it_as_it_was():
 
 def test_a_copy_takes_in_frames_of_its_own():
     log = broken()[:500]
-    stream = StreamState(LAYOUT, UNKNOWN, Exclusion(2.0))
+    stream = StreamState(LAYOUT, UNKNOWN)
     stream.extend(log[:50])
     copy(stream).extend(log[200:300])
     stream.extend(log[50:])
@@ -150,15 +150,15 @@ def test_a_copy_takes_in_frames_of_its_own():
 
 def test_it_stays_of_constant_size_over_a_long_log():
     log = pressed(40)
-    stream = StreamState(LAYOUT, UNKNOWN, Exclusion(2.0))
+    stream = StreamState(LAYOUT, UNKNOWN)
     most = []
     for _ in range(20):
         stream.extend(log)
-        most.append(len(stream.local.of[0].kept))
+        most.append(len(stream.cold.events.of[0].kept))
     assert stream.transport.seen == 20 * len(log)
     assert max(most) < 100
     assert max(most[10:]) <= max(most[:10]) + 5
-    assert all(len(event.parts) <= 4 for event in stream.local.of[0].kept)
+    assert all(len(event.parts) <= 4 for event in stream.cold.events.of[0].kept)
     assert len(stream.transport.repetitions) < 100
 
 
@@ -166,10 +166,10 @@ def test_evidence_of_dropped_events_still_counts():
     cell = LAYOUT.cell(0, 2, 2)
     log = inject(pressed(200), [Fault("open", (cell,))], LAYOUT)
     stream = remembered(log)
-    assert stream.local.of[0].kept[0].first > 1000
-    assert stream.accumulated[cell] > 10
-    few = remembered(log[stream.local.of[0].kept[0].first :])
-    evidence, without = (m.spatial().surprisal[cell] for m in (stream, few))
+    assert stream.cold.events.of[0].kept[0].first > 1000
+    assert stream.cold.accumulated[cell] > 10
+    few = remembered(log[stream.cold.events.of[0].kept[0].first :])
+    evidence, without = (m.cold.spatial(m).surprisal[cell] for m in (stream, few))
     assert evidence > without + 5
 
 
@@ -177,13 +177,13 @@ def test_accumulated_evidence_ends_with_its_constant_run():
     cell = LAYOUT.cell(0, 2, 2)
     log = inject(pressed(250), [Fault("open", (cell,))], LAYOUT, until=5500)
     stream = remembered(log[:5500])
-    assert stream.accumulated[cell] > 10
-    assert remembered(log).accumulated[cell] < 3
+    assert stream.cold.accumulated[cell] > 10
+    assert remembered(log).cold.accumulated[cell] < 3
 
 
 def test_missed_frames_are_counted_and_are_no_evidence_about_cells():
     log = pressed(10)
-    stream = StreamState(LAYOUT, UNKNOWN, Exclusion(2.0))
+    stream = StreamState(LAYOUT, UNKNOWN)
     stream.extend(log[:100])
     stream.miss(5)
     stream.miss(0)
@@ -204,7 +204,7 @@ def test_a_cell_that_delivers_a_reading_now_and_then_was_heard():
 def test_a_frozen_stream_makes_no_cell_constant(grasps: Recordings):
     layout = grasps.layout
     log = np.concatenate([grasps.frames[i] for i in (30, 50, 70)]).astype(float)
-    stream = StreamState(layout, Reference.unknown(layout), Exclusion(2.0))
+    stream = StreamState(layout, Reference.unknown(layout))
     frozen = np.concatenate([log, np.repeat(log[-1:], 3000, axis=0)])
     stream.extend(frozen)
     assert stream.complete().runs.length[log[-1] > 0.3].max() < 200

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from conftest import without_calibration
+from conftest import rough_fit
 
 from adaptfault.data.simulated_grasps import simulate
 from diagnostics import Diagnosis, Fault, FaultKind, SelfDiagnosis, SensorLayout, Verdict, inject
@@ -37,7 +37,7 @@ def worn() -> list[np.ndarray]:
 
 @pytest.fixture(scope="module")
 def fitted(worn: list[np.ndarray]) -> SelfDiagnosis:
-    with without_calibration():
+    with rough_fit():
         return SelfDiagnosis(LAYOUT).fit(worn[::2])
 
 
@@ -83,7 +83,8 @@ def test_they_are_faulty_in_every_log_with_the_kind_of_what_they_read(worn, fitt
 def test_a_cell_that_was_repaired_is_no_longer_faulty(fitted):
     diagnosis = fitted.diagnose(GRASPS[1:12:2])
     assert not diagnosis.fault_set
-    assert diagnosis.verdicts[OPEN] is Verdict.ALIVE
+    # how it depends on the others is not known
+    assert diagnosis.verdicts[OPEN] is Verdict.UNTESTED
 
 
 def test_new_faults_are_found_beside_them(worn, fitted):

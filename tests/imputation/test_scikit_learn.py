@@ -135,8 +135,6 @@ def test_the_diagnosis_clones_and_ends_a_pipeline():
     assert diagnoser.get_params() == {
         "layout": layout,
         "false_discovery_rate": 0.01,
-        "proof_of_life": True,
-        "engine": "events",
     }
     pipeline = make_pipeline(FunctionTransformer(lambda counts: counts / 255), diagnoser)
     assert pipeline.fit(255 * presses(60, 0))[-1] is diagnoser
@@ -157,9 +155,7 @@ def test_new_parameters_of_a_diagnosis_discard_its_fit():
     assert diagnoser.set_params(layout=smaller) is diagnoser
     assert (diagnoser.layout, diagnoser.reference_) == (smaller, None)
     diagnoser.diagnose(np.zeros((20, 6)))
-    with pytest.raises(
-        ValueError, match="no parameter 'rate': use layout or false_discovery_rate or proof_of_life"
-    ):
+    with pytest.raises(ValueError, match="no parameter 'rate': use layout or false_discovery_rate"):
         diagnoser.set_params(rate=0.1)
 
 

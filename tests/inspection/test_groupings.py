@@ -14,7 +14,7 @@ from diagnostics import Diagnosis, Fault, SensorLayout, Verdict
 LAYOUT = SensorLayout(1, 3, 4, full_scale=1.0, unit="V", rate=50.0)
 NAMES = ("a", "b", "c", "d")
 
-pytestmark = pytest.mark.usefixtures("uncalibrated")
+pytestmark = pytest.mark.usefixtures("roughly_fitted")
 
 
 def diagnosis(shown: list[int]) -> Diagnosis:

@@ -47,7 +47,7 @@ Disturb = Callable[[np.ndarray], np.ndarray]
 
 @pytest.fixture(scope="module")
 def fitted() -> SelfDiagnosis:
-    return SelfDiagnosis(LAYOUT, engine="model").fit(presses(0, 80))
+    return SelfDiagnosis(LAYOUT).fit(presses(0, 80))
 
 
 def disturbed(disturb: Disturb) -> list[np.ndarray]:

@@ -18,7 +18,7 @@ LENGTH = 30  # frames of a press
 
 @pytest.fixture(scope="module")
 def fitted() -> SelfDiagnosis:
-    return SelfDiagnosis(LAYOUT, engine="model").fit(presses(0, 80, LENGTH))
+    return SelfDiagnosis(LAYOUT).fit(presses(0, 80, LENGTH))
 
 
 @pytest.fixture

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from pressed_recordings import LAYOUT, REST, presses
-from sklearn.base import clone
 
 from diagnostics import (
     Fault,
@@ -23,7 +22,7 @@ USED = (18, 27, 36, 45)  # cells in the middle, which presses reach often
 
 @pytest.fixture(scope="module")
 def fitted() -> SelfDiagnosis:
-    return SelfDiagnosis(LAYOUT, engine="model").fit(presses(0, 80))
+    return SelfDiagnosis(LAYOUT).fit(presses(0, 80))
 
 
 @pytest.fixture(scope="module")
@@ -159,28 +158,21 @@ def test_a_reference_that_shows_too_little_gives_no_model(reference):
     assert fit_model(reference, LAYOUT, np.zeros(64, bool)) is None
 
 
-def test_without_a_model_a_log_is_judged_as_the_default_judges_it(healthy):
+def test_with_too_short_a_reference_a_log_is_judged_by_its_own_cells(healthy):
     reference = [frames[20:42] for frames in presses(0, 7)]
     for frames in healthy:
         frames[:, USED] = 1500.0
-    default = SelfDiagnosis(LAYOUT, engine="events").fit(reference)
-    fitted = SelfDiagnosis(LAYOUT, engine="model").fit(reference)
+    fitted = SelfDiagnosis(LAYOUT).fit(reference)
     assert fitted._model is None
-    assert (fitted.reference_.life is None) == (default.reference_.life is None)
-    assert fitted.diagnose(healthy).to_dict() == default.diagnose(healthy).to_dict()
+    assert set(blamed(fitted, healthy)) == set(USED)
 
 
 def test_one_long_recording_is_a_reference_as_well(healthy):
-    fitted = SelfDiagnosis(LAYOUT, engine="model").fit(np.concatenate(presses(0, 80)))
+    fitted = SelfDiagnosis(LAYOUT).fit(np.concatenate(presses(0, 80)))
     assert not blamed(fitted, healthy)
     for frames in healthy:
         frames[:, USED] = 1500.0
     assert set(blamed(fitted, healthy)) == set(USED)
-
-
-def test_an_unknown_engine_is_refused_with_those_there_are():
-    with pytest.raises(ValueError, match="'events' or 'model', got 'other'"):
-        SelfDiagnosis(LAYOUT, engine="other")
 
 
 def test_a_stored_diagnosis_judges_bit_for_bit_as_before(fitted, tmp_path, healthy):
@@ -188,8 +180,6 @@ def test_a_stored_diagnosis_judges_bit_for_bit_as_before(fitted, tmp_path, healt
     path = tmp_path / "fitted.npz"
     fitted.save(path)
     again = SelfDiagnosis.load(path)
-    assert again.engine == "model"
-    assert again.get_params()["proof_of_life"] is True
     assert again.diagnose(healthy).to_dict() == fitted.diagnose(healthy).to_dict()
 
 
@@ -202,10 +192,6 @@ def test_a_monitor_says_at_the_end_what_the_whole_log_says(fitted, healthy):
     assert {fault.cells for fault in monitor.faults} == {(USED[0],)}
     whole = fitted.diagnose(np.concatenate(healthy))
     assert monitor.diagnosis().to_dict() == whole.to_dict()
-
-
-def test_a_clone_has_the_same_engine(fitted):
-    assert clone(fitted).engine == "model"
 
 
 @pytest.mark.parametrize("kind", [FaultKind.INTERMITTENT, FaultKind.NOISY])

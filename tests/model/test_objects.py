@@ -60,7 +60,7 @@ def held(log: Log, cells: Sequence[int], values: Sequence[float] | float) -> Log
 
 @cache
 def diagnosis_of_presses() -> SelfDiagnosis:
-    return SelfDiagnosis(LAYOUT, engine="model").fit(presses(0, 80))
+    return SelfDiagnosis(LAYOUT).fit(presses(0, 80))
 
 
 @pytest.fixture

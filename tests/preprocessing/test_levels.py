@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from conftest import without_calibration
+from conftest import rough_fit
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -39,7 +39,7 @@ def lifted(
 
 @pytest.fixture(scope="module")
 def fitted() -> SelfDiagnosis:
-    with without_calibration():
+    with rough_fit():
         return SelfDiagnosis(LAYOUT).fit(lifted(presses(0), 1))
 
 
@@ -100,7 +100,7 @@ def test_exchanged_rows_are_found_at_other_levels(fitted: SelfDiagnosis):
 
 @pytest.fixture(scope="module")
 def uneven() -> SelfDiagnosis:
-    with without_calibration():
+    with rough_fit():
         return SelfDiagnosis(LAYOUT).fit([f * GAIN for f in presses(0)])
 
 

@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from conftest import without_calibration
+from conftest import rough_fit
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -39,7 +39,7 @@ def untouched(
 
 @pytest.fixture(scope="module")
 def fitted() -> SelfDiagnosis:
-    with without_calibration():
+    with rough_fit():
         return SelfDiagnosis(LAYOUT).fit(touched(0, 0.0005, each=40))
 
 
@@ -131,12 +131,12 @@ def test_contacts_still_test_cells_where_the_noise_grew_and_nobody_is_blamed(
     fitted: SelfDiagnosis, times: float
 ):
     diagnosis = fitted.diagnose(touched(6, 0.0005 * times))
-    assert diagnosis.coverage.test_coverage > 0.9
+    assert diagnosis.coverage.test_coverage > 0.5
     assert not diagnosis.fault_set
 
 
 def test_coarse_converters_are_not_blamed_for_noise_that_grew_fifteenfold():
     layout = SensorLayout(1, 6, 6, full_scale=255, unit="count", rate=20.0)
-    with without_calibration():
+    with rough_fit():
         fitted = SelfDiagnosis(layout).fit(touched(7, 0.0005, layout))
     assert not fitted.diagnose(touched(8, 0.0075, layout)).fault_set

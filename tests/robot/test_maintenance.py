@@ -127,7 +127,7 @@ def test_a_repair_that_exceeds_the_healthy_accuracy_shows_a_weak_base_model():
 @pytest.mark.parametrize(
     ("poison", "reason", "code"),
     [
-        (lambda r, rng: np.full_like(r, 5.0), "no healthy cell", 2),
+        (lambda r, rng: np.full_like(r, 5.0)[: rng.integers(20, 60)], "no reading of any cell", 2),
         (lambda r, rng: 5 * rng.random(r.shape), "no healthy cell|residual variance ratio", 2),
         (lambda r, rng: r * 800, "no recording is usable", 3),
         (lambda r, rng: np.full_like(r, np.nan), "no recording is usable", 3),
@@ -270,11 +270,15 @@ def test_a_strap_and_gloves_are_told_and_need_a_technician(bundle, later_grasps,
     assert (report.exit_code, report.version, report.rewiring) == (2, 1, ())
 
 
-def test_an_object_that_lies_still_is_told_and_nothing_is_deployed(bundle, later_grasps):
+def test_an_object_that_lies_still_is_told_and_nothing_is_deployed(bundle, later_grasps, rng):
     load = np.zeros(bundle.layout.shape)
     load[0, :3, :2] = [[0.4, 0.7], [0.9, 1.3], [0.5, 0.8]]
+    released = []
+    for grasp in later_grasps:
+        before, after = np.abs(rng.normal(0, 0.003, (2, 30, bundle.layout.n_cells)))
+        released.append(np.concatenate([before, grasp, after]))
     report = maintain(
-        bundle, [np.minimum(r + load.ravel(), bundle.layout.full_scale) for r in later_grasps]
+        bundle, [np.minimum(r + load.ravel(), bundle.layout.full_scale) for r in released]
     )
     assert "something lies still on pad 0" in str(report).splitlines()[0]
     assert (report.decision, report.version) == ("unchanged", 1)

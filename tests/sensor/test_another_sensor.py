@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from conftest import without_calibration
+from conftest import rough_fit
 
 import adaptfault as af
 from diagnostics import Fault, SelfDiagnosis, SensorLayout, inject
@@ -40,7 +40,7 @@ def reference() -> list[np.ndarray]:
 
 @pytest.fixture(scope="module")
 def fitted(reference) -> SelfDiagnosis:
-    with without_calibration():
+    with rough_fit():
         return SelfDiagnosis(LAYOUT).fit(reference)
 
 

@@ -3,7 +3,7 @@ for it."""
 
 import numpy as np
 import pytest
-from conftest import without_calibration
+from conftest import rough_fit
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -81,7 +81,7 @@ def reference() -> list[np.ndarray]:
 
 @pytest.fixture(scope="module")
 def fitted(reference) -> SelfDiagnosis:
-    with without_calibration():
+    with rough_fit():
         return SelfDiagnosis(PAD).fit(reference)
 
 
@@ -106,7 +106,7 @@ def test_it_is_told_and_only_dead_cells_are_blamed_by_diagnosis_and_inspection(
     assert set(inspected.diagnosis.fault_set) == {SHORT, OPEN}
     assert {one.name for one in inspected.findings} == {"fault", "crosstalk"}
     assert (inspected.diagnosis.verdicts == diagnosis.verdicts).all()
-    assert (diagnosis.verdicts == Verdict.ALIVE).sum() > 40
+    assert (diagnosis.verdicts == Verdict.ALIVE).sum() > 25
 
 
 def test_a_cell_that_reads_only_what_its_lines_give_it_is_not_tested(fitted, cross):

@@ -105,7 +105,8 @@ def test_hum_of_all_cells_is_told_and_taken_out_and_a_dead_cell_beside_it_is_fou
     humming = [hum(r, amplitude) for r in log]
     found = af.inspect(humming, known, reference=reference)
     assert "hum" in names(found)
-    assert 2 * len(found.diagnosis.fault_set) < len(known.diagnose(humming).fault_set)
+    assert not found.diagnosis.fault_set
+    assert not known.diagnose(humming).fault_set
     for frames in humming:
         frames[:, busy] = 1023
     assert busy in af.inspect(humming, known, reference=reference).diagnosis.fault_set
@@ -155,7 +156,7 @@ def test_more_noise_of_all_cells_is_told(known, reference, log, times):
     assert found.severity >= 1
 
 
-@pytest.mark.usefixtures("uncalibrated")
+@pytest.mark.usefixtures("roughly_fitted")
 def test_lost_bits_of_the_converter_are_told(known, reference, log):
     assert "quantised" in names(af.inspect([r // 64 * 64 for r in log], known, reference=reference))
 
@@ -168,7 +169,7 @@ def saturated(frames: np.ndarray) -> np.ndarray:
     return np.minimum(8 * frames, 700)
 
 
-@pytest.mark.usefixtures("uncalibrated")
+@pytest.mark.usefixtures("roughly_fitted")
 @pytest.mark.parametrize(("changed", "name"), [(fewer_bits, "quantised"), (saturated, "saturated")])
 def test_behind_a_changed_converter_a_dead_cell_is_found_and_at_most_one_other_is_blamed(
     known, reference, log, busy, changed, name
@@ -182,15 +183,15 @@ def test_behind_a_changed_converter_a_dead_cell_is_found_and_at_most_one_other_i
     assert len(found.diagnosis.fault_set) <= 2
 
 
-def test_each_cell_that_creeps_by_its_own_offset_is_a_ramp_and_hardly_one_is_blamed(
+def test_each_cell_that_creeps_by_its_own_offset_is_a_ramp_and_none_is_blamed(
     known, reference, log
 ):
     offset = np.random.default_rng(0).uniform(0, 0.08 * 1023, D)
     creeping = [counts(r + offset * i / len(log)) for i, r in enumerate(log)]
-    blamed = len(known.diagnose(creeping).fault_set)
     found = af.inspect(creeping, known, reference=reference)
     assert "ramp" in names(found)
-    assert len(found.diagnosis.fault_set) < blamed / 4
+    assert not found.diagnosis.fault_set
+    assert not known.diagnose(creeping).fault_set
 
 
 def test_a_pad_that_nothing_touches_is_not_faulty_but_untested_and_a_dead_cell_on_it_is_found(
@@ -204,8 +205,7 @@ def test_a_pad_that_nothing_touches_is_not_faulty_but_untested_and_a_dead_cell_o
         frames[:, -1] = 1023
     found = af.inspect(untouched, known, reference=reference)
     assert found.diagnosis.fault_set == {D - 1}
-    (wire,) = found.diagnosis.possible
-    assert wire.reason.startswith("nothing touched pad 1, or pad 1, converter channel is open")
+    assert any("press pad 1" in advice for advice in found.diagnosis.coverage.advice)
     assert ("untested", 1) in {(one.name, one.severity) for one in found.findings}
 
 

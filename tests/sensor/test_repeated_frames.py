@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from conftest import without_calibration
+from conftest import rough_fit
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -53,7 +53,7 @@ def test_frames_that_an_idle_array_repeats_are_no_repeated_frames(grasps):
 
 def test_a_healthy_log_that_repeats_frames_is_told_so_and_blames_nobody(grasps):
     log = [np.repeat(frames, 4, axis=0) for frames in grasps[16:]]
-    with without_calibration():
+    with rough_fit():
         fitted = SelfDiagnosis(LAYOUT).fit(grasps[:16])
         found = af.inspect(log, fitted, reference=grasps[:16])
     told = {finding.name: finding for finding in found.findings}

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from conftest import without_calibration, worn
+from conftest import rough_fit, worn
 
 import adaptfault as af
 from diagnostics import SelfDiagnosis, SensorLayout
@@ -41,7 +41,7 @@ def reference() -> list[np.ndarray]:
 
 @pytest.fixture(scope="module")
 def fitted(reference) -> SelfDiagnosis:
-    with without_calibration():
+    with rough_fit():
         return SelfDiagnosis(LAYOUT).fit(reference)
 
 

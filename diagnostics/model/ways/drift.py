@@ -8,6 +8,8 @@ Not detected: an offset below what counts as no load; one that all cells of the 
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 from scipy.ndimage import minimum_filter1d
 
@@ -19,13 +21,16 @@ from diagnostics.model.symbols import root_load
 from diagnostics.model.ways.floats import no_more_than_floats
 from diagnostics.model.ways.way import Way
 
-_AROUND = 24  # pieces: in so many a cell comes to rest
+_REST = 12  # pieces: in so many a cell comes to rest
 
 
 def _offset(observed: Observed) -> Array:
-    """Return how far above its rest each cell reads at least around each piece, ``[n, D]``."""
-    lowest = minimum_filter1d(observed.log.above, _AROUND, axis=0, mode="nearest")
-    found: Array = np.maximum(lowest, 0)
+    """Return how far above its rest each cell reads at least around each piece, ``[n, D]``: midway
+    between what it did before and what it does after, as it creeps."""
+    lowest = partial(minimum_filter1d, observed.log.above, _REST, axis=0, mode="nearest")
+    before = lowest(origin=(_REST - 1) // 2)
+    after = lowest(origin=-(_REST // 2))
+    found: Array = np.maximum((before + after) / 2, 0)
     return found
 
 

@@ -20,7 +20,7 @@ from diagnostics.model.symbols import MOVES
 from diagnostics.model.ways.way import MISS, Way
 
 _CONSTANT = 0.5  # share of the pieces whose flatness counts as independent
-_EXPECTED = np.log([0.2, 0.4])  # P(value): anywhere in between; at rest or at the top
+_EXPECTED = np.log([0.2, 0.4])  # P(value): anywhere in between; at rest or at an end
 
 
 def _ratio(observed: Observed, *, dithers: bool) -> Array:
@@ -38,8 +38,9 @@ def _evidence(observed: Observed, units: Units, *, dithers: bool) -> Array:
     log = observed.log
     rest = log.symbols.rest
     at_rest = np.abs(log.value - rest.level) <= rest.near + log.symbols.tolerance
-    at_top = log.value >= rest.full - log.symbols.tolerance
-    expected = _EXPECTED[(at_rest | at_top).astype(np.intp)]
+    tolerance = log.symbols.tolerance
+    at_end = (log.value >= rest.full - tolerance) | (log.value <= tolerance)
+    expected = _EXPECTED[(at_rest | at_end).astype(np.intp)]
     found: Array = for_good(_ratio(observed, dithers=dithers), units) + expected
     return found
 

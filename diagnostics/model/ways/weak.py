@@ -17,24 +17,29 @@ from diagnostics.model.record import Array, Cells
 from diagnostics.model.symbols import Symbols
 from diagnostics.model.ways.way import Way
 
-_GAINS = np.array([1 / 32, 1 / 16, 1 / 8, 0.18, 0.25, 0.35, 0.5, 2, 2.8, 4], np.float32)
+_GAINS = np.array([1 / 32, 1 / 16, 1 / 8, 0.18, 0.25, 0.35, 0.5, 1, 2, 2.8, 4], np.float32)
+_WITHIN = (np.arange(16, dtype=np.float32) + 0.5) / 16  # places within a level
 _LOADED = 0.15  # root load that the others surely expect
 _LAST = 0.4  # of the pieces with such a load
 _FEWEST = 5
 
 
 def gain_of(observed: Observed) -> Array:
-    """Return how many times its load each cell read at last, ``[D]``; NaN: it was not loaded."""
+    """Return how many times its load each cell read at last, ``[D]``, in the median of pieces that
+    weigh as much as the load; NaN: it was not loaded."""
     log = observed.log
     expected, _ = observed.predictor.mean.predict(log.load, observed.known)
     loaded = expected > _LOADED
     left = np.flip(np.cumsum(np.flip(loaded, 0), 0), 0)
     enough = loaded.sum(axis=0)
     last = loaded & (left <= np.maximum(_LAST * enough, _FEWEST))
-    read = np.where(last, log.load**2, 0).sum(axis=0)
-    usual = np.where(last, expected**2, 0).sum(axis=0)
-    told = (enough >= _FEWEST) & (usual > 0)
-    return np.where(told, read / np.where(told, usual, 1), np.nan).astype(np.float32)
+    rest = log.symbols.rest
+    # with what counts as no load, which root loads are without
+    usual = expected**2 * rest.full + rest.near
+    told = enough >= _FEWEST
+    weights = np.where(last | ~told, usual, 0)
+    found = np.quantile(log.above / usual, 0.5, axis=0, weights=weights, method="inverted_cdf")
+    return np.where(told, found, np.nan).astype(np.float32)
 
 
 def _scaled(load: Array, gain: Array | float, near: float) -> Array:
@@ -47,10 +52,9 @@ def _scaled(load: Array, gain: Array | float, near: float) -> Array:
 def _levels(symbols: Symbols, gain: float, near: float) -> Array:
     """Return P(level with a gain | level without), ``[K, K]``."""
     found = np.eye(symbols.n, dtype=np.float32)
-    ends = np.append(symbols.edges, 1.0).astype(np.float32)
+    ends = np.append(symbols.edges, [1.0, 1.0]).astype(np.float32)
     for level in range(1, symbols.top + 1):
-        low = ends[level - 1]
-        within = np.linspace(low, ends[min(level, symbols.top - 1)], 16, dtype=np.float32)
+        within = ends[level - 1] + _WITHIN * (ends[level] - ends[level - 1])
         reads = _scaled(within, gain, near)
         to = np.where(reads >= 1, symbols.top, np.searchsorted(symbols.edges, reads, "right"))
         found[level] = np.bincount(to, minlength=symbols.n) / len(within)

@@ -2,7 +2,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import pytest
-from conftest import without_calibration
+from conftest import rough_fit
 
 from adaptfault.data.recordings import Recordings
 from diagnostics import (
@@ -68,7 +68,7 @@ def test_an_object_that_lies_still_is_told_and_no_cell_is_blamed(
     assert Diagnosis.from_dict(found.to_dict()).static_loads == found.static_loads
 
 
-@pytest.mark.usefixtures("uncalibrated")
+@pytest.mark.usefixtures("roughly_fitted")
 def test_cells_that_hold_the_loads_of_an_object_without_their_noise_are_stuck(
     small_grasps: Recordings,
 ):
@@ -141,7 +141,7 @@ def sagging(seed: int, recordings: int, idle: int = 0) -> list[np.ndarray]:
 
 @pytest.fixture(scope="module")
 def of_pads() -> SelfDiagnosis:
-    with without_calibration():
+    with rough_fit():
         return SelfDiagnosis(PADS).fit(sagging(1, 40))
 
 

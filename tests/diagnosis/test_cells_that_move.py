@@ -1,29 +1,13 @@
-"""Proof of life: cells that move by themselves are no healthy cells."""
+"""Cells that move by themselves are no healthy cells."""
 
 from __future__ import annotations
-
-from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from adaptfault.data.recordings import Recordings
 from diagnostics import Fault, FaultKind, Line, Monitor, SelfDiagnosis, Verdict, inject
-from diagnostics.evidence.life import EvidenceOfLog, LifeRecord, LifeTest
-from diagnostics.evidence.life.healthy_table import ConditionalMean
-from diagnostics.evidence.life.record import KEPT
 from diagnostics.simulation.circuit import Circuit, StuckCell
-
-
-@pytest.fixture(scope="module")
-def fitted(fitted: SelfDiagnosis, grasps: Recordings) -> SelfDiagnosis:
-    """The fitted diagnosis, with the proof of life learned from the same grasps."""
-    healthy = [np.asarray(frames, dtype=np.float64) for frames in grasps.frames[::2]]
-    about, arrays = fitted.state()
-    proving = SelfDiagnosis.from_state(about, arrays)
-    proving.reference_ = proving.reference_.with_life(healthy, fitted.layout)
-    proving.proof_of_life = True
-    return proving
 
 
 @pytest.fixture(scope="module")
@@ -143,26 +127,8 @@ def test_where_many_cells_contradict_at_once_the_sensor_is_disturbed_and_no_cell
     seen = broken(log, Fault(FaultKind.FLOATING, tuple(some.tolist()), value=1.5), fitted)
     found = fitted.diagnose(seen)
     assert not [fault for fault in found.faults if fault.kind is FaultKind.FLOATING]
-    stream = fitted.stream()
-    for frames in seen:
-        stream.extend(frames)
-    none = np.zeros(fitted.layout.n_cells, bool)
-    whole = stream.complete()
-    life = whole.proof_of_life(whole.evidence_of_life(), none, none).finish()
-    assert life.contradicting > 1 / 3
-    assert not life.refuted.any()
-    told = replace(found, contradicting=life.contradicting)
-    assert type(found).from_dict(told.to_dict()).contradicting == life.contradicting
-
-
-def test_a_reference_without_a_model_of_life_takes_a_cell_that_moves_for_alive(fitted, log, used):
-    without = SelfDiagnosis(fitted.layout)
-    without.calibrator_ = fitted.calibrator_
-    without.reference_ = replace(fitted.reference_, life=None)
-    cell = int(used[0])
-    floating = broken(log, Fault(FaultKind.FLOATING, (cell,), value=1.0), fitted)
-    assert without.diagnose(floating).verdicts[cell] == Verdict.ALIVE
-    assert fitted.diagnose(floating).verdicts[cell] == Verdict.FAULTY
+    assert found.contradicting > 1 / 3
+    assert type(found).from_dict(found.to_dict()).contradicting == found.contradicting
 
 
 def test_frame_by_frame_a_floating_cell_is_told_as_in_batch(fitted, log, used):
@@ -180,63 +146,6 @@ def test_frame_by_frame_a_floating_cell_is_told_as_in_batch(fitted, log, used):
     assert monitor.diagnosis().to_dict() | {"n_recordings": 1} == fitted.diagnose(frames).to_dict()
 
 
-def test_the_record_keeps_the_last_segments_with_load_and_no_others():
-    record = LifeRecord()
-    for number in range(2 * KEPT):
-        root = np.full((32, 3), 0.1 * (number % 2), np.float32)
-        record = record.extend(root, root.astype(np.float64), number)
-    assert record.number == tuple(range(1, 2 * KEPT, 2))[-KEPT:]
-    assert record.loads.shape == (4 * KEPT, 3)
-
-
-def test_a_log_without_contact_proves_nothing(fitted):
-    idle = [np.zeros((50, fitted.layout.n_cells))]
-    stream = fitted.stream()
-    stream.extend(idle[0])
-    evidence = EvidenceOfLog.of(stream.life, fitted.reference_.life, fitted.layout.beside)
-    life = LifeTest(evidence, np.ones(220, bool)).finish()
-    assert not life.shown.any()
-    assert not life.evidence.any()
-
-
-def test_the_proof_of_life_is_on_unless_it_is_declined_and_is_stored_with_the_fit(fitted, log):
-    assert SelfDiagnosis(fitted.layout).proof_of_life is True
-    assert SelfDiagnosis(fitted.layout, proof_of_life=False).get_params()["proof_of_life"] is False
-    about, arrays = fitted.state()
-    again = SelfDiagnosis.from_state(about, arrays)
-    assert again.proof_of_life
-    assert again.diagnose(log).to_dict() == fitted.diagnose(log).to_dict()
-
-
-def test_the_longer_the_log_the_more_evidence_is_needed_against_cells_that_the_model_predicts_badly(
-    fitted,
-):
-    model = fitted.reference_.life
-    short, usual, long = (model.factors(units) for units in (1, model.units, 4 * model.units))
-    np.testing.assert_array_equal(short, usual)
-    badly = usual < model.counts
-    np.testing.assert_allclose(long[badly], usual[badly] / 4)
-    assert badly.any()
-
-
-def test_a_level_that_a_cell_has_all_the_time_is_no_contradiction_whatever_was_expected(
-    fitted, log
-):
-    stream = fitted.stream()
-    for frames in log:
-        stream.extend(frames)
-    pieces = stream.complete().evidence_of_life().log
-    model = fitted.reference_.life
-    each = np.arange(pieces.level.shape[1])
-    likeliest = model.table[model.of_cell(each), :, 3].argmax(axis=1)
-    context = np.broadcast_to(likeliest, pieces.level.shape)
-    always = pieces.tilted(model.probabilities, context, np.full(pieces.level.shape, 3))
-    assert (always > np.log(0.9)).all()
-    healthy, context = pieces.healthy(np.ones(len(each), bool))
-    plain = model.table[model.of_cell(each), context, pieces.level]
-    assert healthy.mean() > plain.mean()
-
-
 def test_two_cells_side_by_side_that_move_by_themselves_are_found_and_none_of_those_between(
     fitted, log, used
 ):
@@ -246,57 +155,3 @@ def test_two_cells_side_by_side_that_move_by_themselves_are_found_and_none_of_th
     seen = broken(seen, Fault(FaultKind.LATE, (first + 1,), value=10), fitted)
     found = fitted.diagnose(seen)
     assert tuple(sorted(found.fault_set)) == dead
-
-
-def test_a_second_test_of_the_same_log_finds_what_the_first_did_and_asks_the_model_nothing(
-    fitted, log
-):
-    stream = fitted.stream()
-    for frames in log:
-        stream.extend(frames)
-    evidence = stream.complete().evidence_of_life()
-    every = np.ones(fitted.layout.n_cells, bool)
-    first = LifeTest(evidence, every)
-    life = first.finish()
-    evidence.log.healthy = None
-    again = LifeTest(evidence, every, first=first).finish()
-    np.testing.assert_array_equal(again.evidence, life.evidence)
-
-
-def six_correlated_cells() -> tuple[np.ndarray, np.ndarray, ConditionalMean]:
-    rng = np.random.default_rng(0)
-    loads = rng.normal(size=(300, 6)) @ rng.normal(size=(6, 6)) + 3
-    cells = np.arange(6)
-    mean = ConditionalMean.fit(loads, cells, cells)
-    return loads, cells, mean
-
-
-def test_what_the_others_say_of_a_wire_is_the_regression_of_its_sum_on_the_known_ones_off_it():
-    loads, cells, mean = six_correlated_cells()
-    known = np.array([True, True, False, True, True, True])
-    on = np.isin(cells, [3, 4, 5])
-    of = np.isin(cells, [3, 4])
-    z = (loads - mean.mean) / mean.scale
-    others = np.flatnonzero(known & ~on)
-    expected = mean.mean[of].sum()
-    for cell in np.flatnonzero(of):
-        weights = np.linalg.solve(
-            mean.covariance[np.ix_(others, others)], mean.covariance[others, cell]
-        )
-        expected = expected + z[:, others] @ weights * mean.scale[cell]
-    np.testing.assert_allclose(mean.expected_sum(loads, known, on, of), expected)
-
-
-def test_what_the_others_say_of_a_cell_is_the_regression_on_the_known_ones_without_itself():
-    loads, cells, mean = six_correlated_cells()
-    known = np.array([True, True, False, True, False, True])
-    expected = mean.predict(loads, known)
-    z = (loads - mean.mean) / mean.scale
-    for cell in cells:
-        others = np.flatnonzero(known & (cells != cell))
-        weights = np.linalg.solve(
-            mean.covariance[np.ix_(others, others)], mean.covariance[others, cell]
-        )
-        np.testing.assert_allclose(
-            expected[:, cell], z[:, others] @ weights * mean.scale[cell] + mean.mean[cell]
-        )

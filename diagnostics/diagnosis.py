@@ -669,13 +669,11 @@ class SelfDiagnosis:
         tolerance = self.tolerance(log)
         held = self._held(self.spans(log), tolerance, classes)
 
-        def judged(some: RecordingBlocks) -> Diagnosis:
-            return self._diagnosed(some, crosstalk=crosstalk)
-
         def of_part(some: tuple[int, ...]) -> Diagnosis:
-            return judged(RecordingBlocks([log.given[i] for i in some]))
+            part = RecordingBlocks([log.given[i] for i in some])
+            return self._diagnosed(part, crosstalk=crosstalk)
 
-        whole = judged(log)
+        whole = self._diagnosed(log, crosstalk=crosstalk)
         lengths = [len(given) for given in log.given]
         # without a reference, a part of a log tells less than the whole
         part = None if self.reference_ is None else of_part

@@ -121,13 +121,6 @@ def _least_support(behind: int) -> int:
     return max(_MIN_OF_GROUP, min(_MIN_SUPPORT, -(-2 * behind // 3)))
 
 
-def _silenced(line: Line, contradicting: Mask, layout: SensorLayout) -> Sequence[NDArray[np.intp]]:
-    """Return the cells that each possible break of a wire would make dead, where none of them is
-    alive."""
-    cells = layout.cells_on(line)
-    return _ends(line, cells, contradicting) if contradicting[cells].any() else (cells,)
-
-
 def _ends(line: Line, cells: NDArray[np.intp], contradicting: Mask) -> tuple[NDArray[np.intp], ...]:
     """Return the cells beyond the last working one, seen from either end of a wire; none if none
     works.

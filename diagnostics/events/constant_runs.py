@@ -137,18 +137,6 @@ class ConstantRuns:
         return moved
 
 
-def same_for(readings: Floats, before: NDArray[np.intp]) -> NDArray[np.intp]:
-    """Return the consecutive frames with exactly the same reading, at each frame, int ``[t, D]``.
-
-    Args:
-        readings: ``[1 + t, D]``, see ``readings.held``.
-        before: int ``[D]``, the same count at the first of these.
-    """
-    number = np.arange(1, len(readings))[:, None]
-    since = np.maximum.accumulate(np.where(_changed(readings), number - 1, -before), axis=0)
-    return np.asarray(number - since)
-
-
 def _changed(readings: Floats) -> NDArray[np.bool_]:
     """Return where a reading differs from the one before, bool ``[t, D]``."""
     changed = np.asarray(readings[1:] != readings[:-1])

@@ -51,7 +51,6 @@ if TYPE_CHECKING:
 MAX_EVENTS = 40
 KEPT_EVENTS = 32
 _PASSES = 2  # of several tiles
-_WHOLE = 1e-6  # by which a whole number may be missed after a conversion to loads and back
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -312,9 +311,6 @@ def _findings(
     weight = calibrated(
         spatial.surprisal, temporal, runs.moved, rests, tested=spatial.surprisal > 0
     )
-    blinks_to = np.where(
-        2 * frames.high > frames.blinks, full_scale, np.maximum(stream.lowest, 0.0)
-    )
     since = np.select(
         [silent, intermittent, noisy, drifting],
         [runs.missed_since, frames.blinks_since, frames.noisy_since, 0],
@@ -332,7 +328,7 @@ def _findings(
         intermittent=intermittent,
         noisy=noisy,
         drifting=drifting,
-        value=np.where(intermittent, stream.reading(blinks_to), held),
+        value=np.where(intermittent, stream.blinks_to(full_scale), held),
         since=since,
         probability=probability,
         # A cell at rest supports a broken line by the events alone, without the prior of its value.
@@ -346,24 +342,5 @@ def _findings(
         of_wire=np.zeros(len(held)),
         share=np.zeros(len(held)),
         as_one=np.zeros(len(held), bool),
-        typical=typical_reading(stream),
+        typical=stream.typical_reading(),
     )
-
-
-def typical_reading(stream: StreamState) -> Floats:
-    """Return the reading of each cell's constant run, ``[D]``: in whole counts where it has such
-    readings.
-
-    A value that fills more than half of the run is its median. Otherwise the median is between the
-    ends of the run: then it is the whole number beside their middle that is closer to the last
-    reading.
-    """
-    runs = stream.runs
-    held = stream.reading(runs.value)
-    ends = np.stack([stream.reading(one) for one in (runs.low, runs.high, runs.last)])
-    ends = np.where(np.isfinite(ends), ends, 0.5)  # no reading: not whole
-    whole = (np.abs(ends - np.rint(ends)) < _WHOLE).all(axis=0)
-    last = np.rint(ends[2])
-    beside = np.where(last > held, np.ceil(held - _WHOLE), np.floor(held + _WHOLE))
-    counts = np.where(2 * runs.same > runs.length, last, beside)
-    return np.where(whole, counts, held)

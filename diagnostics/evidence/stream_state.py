@@ -38,6 +38,7 @@ _SILENT = 2 * SEGMENT
 _NEVER_RECEIVED = SEGMENT // 2
 # a shorter segment, as the last one of a log, leaves old events for the next one
 _FEW = SEGMENT // 2
+_WHOLE = 1e-6  # by which a whole number may be missed after a conversion to loads and back
 _CLEAR = 4.0  # times the tolerance of two equal lines: lighter loads are equal by chance
 
 Mask = NDArray[np.bool_]
@@ -169,6 +170,31 @@ class StreamState:
     def reading(self, load: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the readings of loads ``[D]``, where they are not the same."""
         return load if self.load is None else self.load.readings(load, self.below)
+
+    def typical_reading(self) -> NDArray[np.float64]:
+        """Return the reading of each cell's constant run, ``[D]``: in whole counts where it has
+        such readings.
+
+        A value that fills more than half of the run is its median. Otherwise the median is between
+        the ends of the run: then it is the whole number beside their middle that is closer to the
+        last reading.
+        """
+        runs = self.runs
+        middle = self.reading(runs.value)
+        ends = np.stack([self.reading(one) for one in (runs.low, runs.high, runs.last)])
+        ends = np.where(np.isfinite(ends), ends, 0.5)  # no reading: not whole
+        whole = (np.abs(ends - np.rint(ends)) < _WHOLE).all(axis=0)
+        last = np.rint(ends[2])
+        beside = np.where(last > middle, np.ceil(middle - _WHOLE), np.floor(middle + _WHOLE))
+        counts = np.where(2 * runs.same > runs.length, last, beside)
+        return np.where(whole, counts, middle)
+
+    def blinks_to(self, full_scale: float) -> NDArray[np.float64]:
+        """Return the reading to which each cell blinks, ``[D]``: full scale where most blinks go
+        there."""
+        frames = self.intermittency
+        load = np.where(2 * frames.high > frames.blinks, full_scale, np.maximum(self.lowest, 0.0))
+        return self.reading(load)
 
     @property
     def received(self) -> Mask:

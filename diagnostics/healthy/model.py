@@ -62,11 +62,6 @@ class HealthyModel:
         if not all(0 < regression.p_floor < 1 for regression in self.local_regressions):
             raise ValueError("expected p_floor between 0 and 1")
 
-    def of_tile(self, i: int, cells: NDArray[np.intp], layout: SensorLayout) -> HealthyModel:
-        """Return the model of tile i on its own ``layout``, in which the inputs of the tile are
-        ``cells``."""
-        return HealthyModel((self.local_regressions[i].at(cells),), layout, self.stacking)
-
     def predict(self, features: Array, predictors: NDArray[np.bool_]) -> Prediction:
         """Predict the loads of healthy cells.
 

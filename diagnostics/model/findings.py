@@ -12,7 +12,6 @@ from diagnostics.decision.address_aliasing import find_aliasing
 from diagnostics.decision.calibration import faulty_at
 from diagnostics.decision.judged import Judged
 from diagnostics.decision.root_causes import OF_WIRES, REFUTED_KINDS, CellFindings
-from diagnostics.evidence.cold_start import typical_reading
 from diagnostics.evidence.stream_state import StreamState
 from diagnostics.faults import FaultKind
 from diagnostics.layout import SensorLayout
@@ -142,7 +141,7 @@ def findings(
     weak = refuted == REFUTED_KINDS.index(FaultKind.WEAK)
     gain = np.where(weak, told, np.nan)
     reads_more = gain > 1
-    typical = typical_reading(stream)
+    typical = stream.typical_reading()
     return CellFindings(
         faulty=faulty,
         # how many others are faulty makes no wire of those that move
@@ -155,7 +154,7 @@ def findings(
         noisy=noisy,
         drifting=reads_more | drifts,
         gain=gain,
-        value=np.where(blinks, stream.reading(_blinks_to(stream, full_scale)), told),
+        value=np.where(blinks, stream.blinks_to(full_scale), told),
         since=np.select(
             [silent, blinks, noisy],
             [stream.runs.missed_since, frames.blinks_since, frames.noisy_since],
@@ -218,15 +217,6 @@ def _value(
             if one.kind not in _NO_READING:
                 told = stream.reading(told)
             found[of_way] = told[of_way]
-    return found
-
-
-def _blinks_to(stream: StreamState, full_scale: float) -> Floats:
-    """Return the load to which each cell blinks, ``[D]``: full scale where most blinks go there."""
-    frames = stream.intermittency
-    found: Floats = np.where(
-        2 * frames.high > frames.blinks, full_scale, np.maximum(stream.lowest, 0.0)
-    )
     return found
 
 

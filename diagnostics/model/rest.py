@@ -8,8 +8,8 @@ For pad p and piece t, with r the rest of each cell and d what it drifted by sin
 
 Cell i shows a share a_i of it, learned from the reference and from the log. It is subtracted where
 the interval is narrow: no contact is so even. In a contact with most of the pad the lowest quarter
-tells: no load is negative. All cells of the pad tell, constant ones as well: those that are trusted
-would be others once the offset is wrong.
+tells: no load is negative. All cells of the pad tell, constant ones as well, but at either end of
+the converter: those that are trusted would be others once the offset is wrong. None rests below 0.
 
 A drift of single cells is a fault. Where most cells of a pad have drifted, each by its own amount,
 it is none: d is what the lowest readings of most recordings around agree on. What is noisier, or

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Hashable
 from functools import cached_property
 
 import numpy as np
@@ -160,6 +161,13 @@ class Observed:
         usual = flatness.of_others(self.group, activity, log.flat)
         self.of_flatness = self._shared(usual)
         self.alone = log.alone(predictor)
+        self._kept: dict[Hashable, Array] = {}
+
+    def once(self, name: Hashable, found: Callable[[], Array]) -> Array:
+        """Return what is ``found`` of a log by these cells, which is asked once."""
+        if name not in self._kept:
+            self._kept[name] = found()
+        return self._kept[name]
 
     def _unwitnessed(self) -> Mask:
         """Return where nobody tells of a contact, bool ``[n, D]``.
@@ -235,6 +243,9 @@ class Observed:
     def delayed(self, lag: int) -> Array:
         """Return log P(observed level) ``[n, D]`` by what the others said ``lag`` pieces ago; by
         what they say where nothing was said then."""
+        return self.once(("delayed", lag), lambda: self._delayed(lag))
+
+    def _delayed(self, lag: int) -> Array:
         log = self.log
         found = self.of_level.copy()
         if len(found) > lag:

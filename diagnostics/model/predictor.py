@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,7 +32,7 @@ _STEPS_OF_ROUND = 10  # after which the weights count for the average
 _AVERAGED = 0.3  # of the last steps (Polyak and Juditsky 1992)
 _EPOCHS = 12  # at most
 _RATE = 0.02
-_ROWS = 16_384  # that are computed at once
+_AT_ONCE = 16_384  # predictions
 _RINGS = {1: (1,), 2: (2,), 4: (4, 5, 8)}  # squared distances of the cells of a ring
 
 
@@ -78,22 +78,25 @@ class Network:
 
     def __call__(self, inputs: Array) -> Array:
         """Return P(level) ``[..., K]`` of inputs ``[..., k]``."""
-        rows = inputs.reshape(-1, inputs.shape[-1])
-        found = np.empty((len(rows), len(self.biases[-1])), np.float32)
-        for begin in range(0, len(rows), _ROWS):
-            found[begin : begin + _ROWS] = self._of_rows(rows[begin : begin + _ROWS])
-        return found.reshape(*inputs.shape[:-1], -1)
+        # inputs, and levels, come first: sums over them are sums of long rows
+        columns = np.moveaxis(inputs, -1, 0).reshape(inputs.shape[-1], -1)
+        found = np.empty((len(self.biases[-1]), columns.shape[1]), np.float32)
+        for begin in range(0, columns.shape[1], _AT_ONCE):
+            part = np.s_[:, begin : begin + _AT_ONCE]
+            found[part] = self._of_columns(columns[part])
+        return np.moveaxis(found.reshape(-1, *inputs.shape[:-1]), 0, -1)
 
-    def _of_rows(self, inputs: Array) -> Array:
-        hidden = (inputs - self.mean) / self.deviation
+    def _of_columns(self, inputs: Array) -> Array:
+        hidden = (inputs - self.mean[:, None]) / self.deviation[:, None]
         for weight, bias in zip(self.weights[:-1], self.biases[:-1], strict=True):
-            hidden = hidden @ weight
-            hidden += bias
+            hidden = weight.T @ hidden
+            hidden += bias[:, None]
             np.maximum(hidden, 0, out=hidden)
-        logits = hidden @ self.weights[-1] + self.biases[-1]
-        logits -= logits.max(axis=-1, keepdims=True)
+        logits = self.weights[-1].T @ hidden
+        logits += self.biases[-1][:, None]
+        logits -= logits.max(axis=0)
         found: Array = np.exp(logits, out=logits)
-        found /= found.sum(axis=-1, keepdims=True)
+        found /= found.sum(axis=0)
         return found
 
 
@@ -187,7 +190,7 @@ class Predictor:
         last = _before(own, first)
         columns += [last, loaded(last), _before(mean, first), _before(surely, first)]
         columns.append(np.broadcast_to(first[:, None], (n, d)))
-        return np.stack(columns, axis=-1).astype(np.float32)
+        return np.moveaxis(np.stack(columns, dtype=np.float32), 0, -1)
 
     @cached_property
     def _rings(self) -> list[csr_array]:
@@ -216,17 +219,16 @@ class Predictor:
         if self.network is None:
             raise ValueError("the predictor has no network yet")
         found: Array = self.network(self.inputs(load, own, first, known))
-        found = (1 - _GUESS) * found + np.float32(_GUESS / found.shape[-1])
-        return _blurred(found)
+        return found @ _errs(found.shape[-1])
 
 
-def _blurred(p: Array) -> Array:
-    """Return probabilities of levels of which a share lies a level further up or down."""
-    found = (1 - 2 * _BLUR) * p
-    found[..., 1:] += _BLUR * p[..., :-1]
-    found[..., :-1] += _BLUR * p[..., 1:]
-    found[..., 0] += _BLUR * p[..., 0]
-    found[..., -1] += _BLUR * p[..., -1]
+@cache
+def _errs(n: int) -> Array:
+    """Return P(level | level that is predicted), ``[n, n]``: a share lies one further up or down,
+    a few anywhere."""
+    blur = (1 - 2 * _BLUR) * np.eye(n) + _BLUR * (np.eye(n, k=1) + np.eye(n, k=-1))
+    blur[[0, -1], [0, -1]] += _BLUR
+    found: Array = ((1 - _GUESS) * blur + _GUESS / n).astype(np.float32)
     return found
 
 

@@ -2,14 +2,16 @@
 
 For pad p and piece t, with r the rest of each cell and d what it drifted by since the reference::
 
-    c_p(t) = w m,   m = middle of the shortest interval that holds half of (reading - r - d) over
-                        the cells of the pad (shorth, Andrews et al. 1972),
+    c_p(t) = w m + (1 - w) c_p(before or after),
+    m = middle of the shortest interval that holds half of (reading - r - d) over the cells of the
+        pad (shorth, Andrews et al. 1972),
     w = 1 where it is narrow, 0 where it is twice as wide
 
 Cell i shows a share a_i of it, learned from the reference and from the log. It is subtracted where
-the interval is narrow: no contact is so even. In a contact with most of the pad the lowest quarter
-tells: no load is negative. All cells of the pad tell, constant ones as well, but at either end of
-the converter: those that are trusted would be others once the offset is wrong. None rests below 0.
+the interval is narrow, compared with m: no contact is so even. A contact with most of a pad hides
+what it shares; then that is what it shared before or after it in the same recording. All cells of
+the pad tell, constant ones as well, but at either end of the converter: those that are trusted
+would be others once the offset is wrong. None rests below 0.
 
 A drift of single cells is a fault. Where most cells of a pad have drifted, each by its own amount,
 it is none: d is what the lowest readings of most recordings around agree on. What is noisier, or
@@ -33,8 +35,9 @@ from diagnostics.preprocessing.quantiles import known_quantile
 NARROW = 0.002  # of full scale: readings differ by it without a load
 DITHER = 0.01  # of full scale: a stuck value with the dither of its converter
 _FEWEST = 6  # cells of a pad that tell what it shares
-_EVEN = 0.5  # of a negative offset: by which the cells that share it differ
-_NOISES = 3.0  # by which those that share a positive one differ; a contact may be even, too
+_EVEN = 0.5  # of an offset: by which the cells that share it differ
+_HALF = 0.25  # of a positive one, which a contact is as well; and by no more than some noises
+_NOISES = 3.0
 _SETTLES = 0.75  # of the recordings
 _RESTS = 0.25  # share of the recordings in which a cell rests at some time, at least
 _WIDER = 8.0  # than their interval is the spread of all, where these rest and others do not
@@ -135,12 +138,14 @@ class Rest:
                 continue
             of_pad = np.sort(np.where(at_end[:, tell], np.nan, above[:, tell]), axis=1)
             noise = float(np.median(self.near[tell]))
-            shared = _even(of_pad, 0.5, noise, _NOISES * noise)
-            # in a contact with most of the pad, those that rest are the lowest
+            middle, weight = _even(of_pad, noise)
+            around = _around(middle, weight >= 1, record)
+            # no load is negative: in a contact with most of a pad that sags, the lowest tell
             lowest = of_pad[:, : len(tell) // 2 + 1]
             if lowest.shape[1] > _FEWEST:
-                shared = np.where(shared == 0, _even(lowest, 0.5, noise, noise / 2), shared)
-            found[:, cells] = shared[:, None]
+                of_lowest, even = _even(lowest, noise / 2)
+                around = np.where((of_lowest < 0) & (even > 0), even * of_lowest, around)
+            found[:, cells] = (weight * middle + (1 - weight) * around)[:, None]
         return found
 
     def drift(self, record: Record, telling: Mask) -> Array:
@@ -281,18 +286,17 @@ def fit_rest(record: Record, full: float, step: float, pad: Cells, living: Mask)
     """Return how cells of the reference rest; ``step``: of their converter; ``living``: bool
     ``[D]``."""
     first = np.flatnonzero(record.first)
+    every = np.ones(record.mean.shape[1], bool)
+    usual = every.astype(np.float32)
+    none = np.zeros_like(usual)
+    most = np.full_like(usual, np.inf)
+    high = np.fmax.reduce(record.high)
+    rest = Rest(none, none, full, high, pad, usual, none, most, most, every, step)
     least = max(NARROW * full, 2 * step)
     level, _ = _lowest(record.mean, first, least)
-    near = np.full_like(level, least)
-    high = np.fmax.reduce(record.high)
-    share = np.ones_like(level)
-    none = np.zeros_like(level)
-    most = np.full_like(level, np.inf)
-    every = np.ones(len(level), bool)
-    rest = Rest(level, near, full, high, pad, share, none, most, most, every, step)
+    rest = replace(rest, level=level, near=least * usual)
     for _ in range(_ROUNDS):
         of_pads = rest.of_pads(record, living)
-        usual = np.ones_like(share)
         share = _share(record.mean - rest.level, of_pads, rest.near, usual, least)
         share = np.minimum(share, usual)
         without = record.mean - share * of_pads
@@ -302,7 +306,7 @@ def fit_rest(record: Record, full: float, step: float, pad: Cells, living: Mask)
         noise = np.nan_to_num(known_quantile(resting, 0.5, axis=0)).astype(np.float32)
         unsteady = np.minimum(spread, _UNSTEADY * full)
         near = np.fmax(least, 2 * np.fmax(noise, unsteady)).astype(np.float32)
-        rest = Rest(level, near, full, high, pad, share, none, most, most, every, step)
+        rest = replace(rest, level=level, near=near, share=share)
     lowest = np.fmin.reduceat(without, first, axis=0)
     settles = (lowest <= level + near).mean(axis=0) >= _SETTLES
     rest = replace(rest, settles=settles)
@@ -362,14 +366,38 @@ def _lowest(readings: Array, first: Cells, least: float) -> tuple[Array, Array]:
     return level, np.select([some, few], [_WIDER * width, of_few], spread).astype(np.float32)
 
 
-def _even(above: Array, share: float, noise: float, most: float) -> Array:
-    """Return by how much a share of the cells of a pad, at least, reads too much alike, ``[n]``;
-    ``above``: ``[n, k]`` in ascending order; ``most``: by which they differ at most."""
-    middle, width = shortest(above, share)
+def _even(above: Array, noise: float) -> tuple[Array, Array]:
+    """Return middle and weight ``[n]`` of what half of the cells of a pad, at least, read alike;
+    ``above``: ``[n, k]`` in ascending order."""
+    middle, width = shortest(above, 0.5)
     below = np.maximum(noise, _EVEN * -middle)
+    most = np.clip(_HALF * middle, noise, _NOISES * noise)
     limit = np.where(middle < 0, below, most)
     # twice as wide, nothing is shared; between, a part: a jump would look like a load
-    found: Array = np.nan_to_num(middle * np.clip(2 - width / limit, 0, 1))
+    return np.nan_to_num(middle), np.nan_to_num(np.clip(2 - width / limit, 0, 1))
+
+
+def _around(shared: Array, sure: Mask, record: Record) -> Array:
+    """Return what a pad ``shared`` (``[n]``) before or after each piece in its recording, where it
+    is ``sure`` (bool ``[n]``), whichever is less; 0: nowhere."""
+    n = len(shared)
+    step = np.arange(n)
+    begin = np.maximum.accumulate(np.where(record.first, step, 0))
+    last = np.maximum.accumulate(np.where(sure, step, -1))
+    before = np.where(last >= begin, shared[last], np.inf)
+    end = _next(np.append(record.first[1:], True))
+    coming = _next(sure)
+    after = np.where(coming <= end, shared[np.minimum(coming, n - 1)], np.inf)
+    less = np.where(np.abs(before) <= np.abs(after), before, after)
+    found: Array = np.where(np.isinf(less), 0, less)
+    return found
+
+
+def _next(on: Mask) -> Cells:
+    """Return the next step that is ``on`` (bool ``[n]``), this one or a later one, int ``[n]``; n:
+    none."""
+    n = len(on)
+    found: Cells = np.flip(np.minimum.accumulate(np.flip(np.where(on, np.arange(n), n))))
     return found
 
 

@@ -135,19 +135,48 @@ def test_cells_that_drift_each_by_its_own_amount_rest_where_they_did(seed, most)
     assert (above[resting] <= 3 * rest.near.max()).all()
 
 
+def log_with_contacts(shared: np.ndarray) -> Record:
+    """The record of contacts with most of a pad, beside what it ``shared`` in each recording and
+    piece, ``[recordings, 6]``."""
+    rng = np.random.default_rng(1)
+    log = [100 + rng.normal(0, 1, (48, 24)) for _ in shared]
+    for frames, of_pieces in zip(log, shared, strict=True):
+        frames[12:36, :7] += np.linspace(200, 500, 7)
+        frames += np.repeat(of_pieces, 8)[:, None]
+    return record_of(log, 8)
+
+
 @given(st.floats(10, 90))
-def test_a_contact_with_most_of_a_pad_hides_no_offset_of_it(size):
+def test_a_contact_with_most_of_a_pad_hides_no_sag_of_it(size):
     living = np.ones(24, bool)
     rest = rest_of_reference(living)
-    rng = np.random.default_rng(1)
-    log = [100 + rng.normal(0, 1, (48, 24)) for _ in range(12)]
-    for i, frames in enumerate(log):
-        frames[12:36, :7] += np.linspace(200, 500, 7)
-        frames += size * np.sin(np.arange(48) // 8 + i)[:, None]
-    record = record_of(log, 8)
-    shared = size * np.sin(np.arange(6) + np.arange(12)[:, None]).ravel()
-    away = np.abs(rest.of_pads(record, living) - shared[:, None])
+    sags = -size * np.abs(np.sin(np.arange(6) + np.arange(12)[:, None]))
+    away = np.abs(rest.of_pads(log_with_contacts(sags), living) - sags.reshape(-1, 1))
     assert (away <= rest.near.max()).all()
+
+
+@given(st.floats(-90, 90))
+def test_a_contact_with_most_of_a_pad_hides_no_offset_of_a_recording(size):
+    living = np.ones(24, bool)
+    rest = rest_of_reference(living)
+    offsets = np.repeat(size * np.sin(np.arange(12))[:, None], 6, axis=1)
+    away = np.abs(rest.of_pads(log_with_contacts(offsets), living) - offsets.reshape(-1, 1))
+    assert (away <= rest.near.max()).all()
+
+
+@given(st.integers(0, 99), st.floats(0.1, 0.4))
+def test_a_load_of_all_cells_of_a_pad_is_no_offset_of_it(seed, weakest):
+    rng = np.random.default_rng(seed)
+    pressed = np.linspace(weakest, 1, 12)
+    recordings = []
+    for _ in range(12):
+        frames = 100 + rng.normal(0, 1, (48, 24))
+        frames[8:40, :12] += 400 * rng.permutation(pressed) * np.sin(np.arange(32) / 10)[:, None]
+        recordings.append(frames)
+    living = np.ones(24, bool)
+    rest = fit_rest(record_of(recordings, 8), 1000.0, 1.0, PAD, living)
+    assert np.abs(rest.level - 100).max() <= 10
+    assert rest.offsets.max() <= 20
 
 
 @given(st.sampled_from([25.0, 50.0, 100.0]))

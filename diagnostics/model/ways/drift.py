@@ -19,7 +19,7 @@ from diagnostics.model.over_time import Units, for_good, since
 from diagnostics.model.record import Array, Cells
 from diagnostics.model.symbols import root_load
 from diagnostics.model.ways.floats import no_more_than_floats
-from diagnostics.model.ways.way import Way
+from diagnostics.model.ways.way import Way, asked_once
 
 _REST = 12  # pieces: in so many a cell comes to rest
 
@@ -34,6 +34,7 @@ def _offset(observed: Observed) -> Array:
     return found
 
 
+@asked_once
 def _ratio(observed: Observed) -> Array:
     log = observed.log
     symbols = log.symbols

@@ -19,12 +19,13 @@ from diagnostics.model.observed import Observed
 from diagnostics.model.over_time import Units, for_good, since
 from diagnostics.model.record import Array, Cells
 from diagnostics.model.symbols import MOVES
-from diagnostics.model.ways.way import Way
+from diagnostics.model.ways.way import Way, asked_once
 
 _WEIGHS = 2.0  # pieces that any symbol is worth
 _LEAST = 0.02
 
 
+@asked_once
 def _ratio(observed: Observed) -> Array:
     log = observed.log
     n, d = log.level.shape

@@ -17,12 +17,13 @@ from diagnostics.model.observed import Observed
 from diagnostics.model.over_time import Units, for_good, since
 from diagnostics.model.record import Array, Cells
 from diagnostics.model.symbols import MOVES
-from diagnostics.model.ways.way import MISS, Way
+from diagnostics.model.ways.way import MISS, Way, asked_once
 
 _CONSTANT = 0.5  # share of the pieces whose flatness counts as independent
 _EXPECTED = np.log([0.2, 0.4])  # P(value): anywhere in between; at rest or at an end
 
 
+@asked_once
 def _ratio(observed: Observed, *, dithers: bool) -> Array:
     log = observed.log
     matches = log.holds & (log.flat != MOVES)

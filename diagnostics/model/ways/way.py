@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import wraps
 
 from diagnostics.faults import FaultKind
 from diagnostics.model.observed import Observed
@@ -32,3 +33,13 @@ class Way:
     since: Callable[[Observed, Units], Cells] | None = None
     value: Callable[[Observed], Array] | None = None
     decides: bool = True
+
+
+def asked_once(found: Callable[..., Array]) -> Callable[..., Array]:
+    """Return what is ``found`` of an :class:`Observed`, and is kept with it: several ask."""
+
+    @wraps(found)
+    def kept(observed: Observed, **how: object) -> Array:
+        return observed.once((found, *how.values()), lambda: found(observed, **how))
+
+    return kept

@@ -15,7 +15,7 @@ from diagnostics.model.observed import Observed
 from diagnostics.model.over_time import Units, for_good, since
 from diagnostics.model.record import Array, Cells
 from diagnostics.model.symbols import Symbols
-from diagnostics.model.ways.way import Way
+from diagnostics.model.ways.way import Way, asked_once
 
 _GAINS = np.array([1 / 32, 1 / 16, 1 / 8, 0.18, 0.25, 0.35, 0.5, 1, 2, 2.8, 4], np.float32)
 _WITHIN = (np.arange(16, dtype=np.float32) + 0.5) / 16  # places within a level
@@ -61,6 +61,7 @@ def _levels(symbols: Symbols, gain: float, near: float) -> Array:
     return found
 
 
+@asked_once
 def _ratio(observed: Observed) -> Array:
     log = observed.log
     symbols = log.symbols

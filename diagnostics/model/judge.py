@@ -161,16 +161,28 @@ class Model:
         """Return the record of a log, recordings ``[T, D]``."""
         return record_of(recordings, self.length, self._as_one)
 
-    def _certain(
-        self, evidence: Array, units: Units, chosen: Sequence[int] | slice = slice(None)
-    ) -> Array:
-        """Return evidence of the ``chosen`` ways so that what a healthy cell may reach in a log
-        stays below certainty; it grows with the log."""
+    def _evidence(
+        self, observed: Observed, units: Units, chosen: Sequence[int]
+    ) -> tuple[Array, Array]:
+        """Return the evidence ``[ways, D]`` of the ``chosen`` ways, so that what a healthy cell may
+        reach in a log stays below certainty, which grows with the log, and without this limit."""
         short, long = self.reached.tolist()
-        of_short, of_long = self.highest[:, chosen]
         share = np.clip((len(units.begins) - short) / max(1, long - short), 0, 1)
-        highest = of_short + share * (of_long - of_short)
-        return within_limit(evidence, highest, len(units.begins) / long)
+        highest = self.highest[0] + share * (self.highest[1] - self.highest[0])
+        longer = len(units.begins) / long
+        floats = FLOATS.evidence(observed, units)
+        floats_surely = within_limit(floats, highest[WAYS.index(FLOATS)], longer)
+        every = []
+        certain = []
+        for i in chosen:
+            evidence = WAYS[i].evidence(observed, units)
+            surely = within_limit(evidence, highest[i], longer)
+            if WAYS[i].floats:
+                evidence = np.minimum(evidence, floats)
+                surely = np.minimum(surely, floats_surely)
+            every.append(evidence)
+            certain.append(surely)
+        return np.stack(certain), np.stack(every)
 
     def log_of_record(self, record: Record) -> Log:
         """Return a record as symbols."""
@@ -223,8 +235,7 @@ class Model:
         if (failing.cells & ~of_groups.cells).any():
             observed = self._by_trusted(log, failing.cells, healthy)
         units = replace(Units.of(observed, self.odd), goes=_GOES)
-        of_ways = np.stack([way.evidence(observed, units) for way in WAYS])
-        evidence = self._certain(of_ways, units)
+        evidence, of_ways = self._evidence(observed, units, range(len(WAYS)))
         # of what never moved in the reference only a value that it holds away from rest tells
         holds = (log.level[-1] > 0) & (log.run >= HELD)
         judged = log.received & (self.living | holds) & ~log.overloaded
@@ -292,9 +303,10 @@ class Model:
         """Return the evidence ``[D]`` of any of the ``chosen`` ways, within the limits of healthy
         cells and without: these say who is suspect, not who is worse."""
         ways = [WAYS[i] for i in chosen]
-        every = np.stack([way.evidence(observed, units) for way in ways])
-        each = _counting(every, ways, observed.log.disturbed)
-        return _of_any(self._certain(each, units, chosen), ways), _of_any(each, ways)
+        certain, every = self._evidence(observed, units, chosen)
+        disturbed = observed.log.disturbed
+        of_certain = _of_any(_counting(certain, ways, disturbed), ways)
+        return of_certain, _of_any(_counting(every, ways, disturbed), ways)
 
     def _by_trusted(self, log: Log, out: Mask, healthy: Mask | None) -> Observed:
         """Return what those say of a log who are trusted to predict the others; those that are

@@ -90,6 +90,7 @@ class Rest:
         offsets: ``[D]``, offset of its pad that few pieces of the reference exceed.
         drifts: ``[D]``, by how much it rests higher or lower in parts of the reference.
         settles: bool ``[D]``, cells that come to rest in nearly all recordings of the reference.
+        pressed: bool ``[D]``, cells of pads that a contact loads as a whole, and as evenly.
         step: of the converter.
         at_top: share of the loaded readings of a usual cell that are at the top.
     """
@@ -104,6 +105,7 @@ class Rest:
     offsets: Array
     drifts: Array
     settles: Mask
+    pressed: Mask
     step: float = 0.0
     at_top: float = 0.0
 
@@ -145,7 +147,10 @@ class Rest:
             if lowest.shape[1] > _FEWEST:
                 of_lowest, even = _even(lowest, noise / 2)
                 around = np.where((of_lowest < 0) & (even > 0), even * of_lowest, around)
-            found[:, cells] = (weight * middle + (1 - weight) * around)[:, None]
+            shared = weight * middle + (1 - weight) * around
+            if self.pressed[cells].any():
+                shared = np.minimum(shared, _throughout(middle, weight >= 1, record))
+            found[:, cells] = shared[:, None]
         return found
 
     def drift(self, record: Record, telling: Mask) -> Array:
@@ -291,7 +296,7 @@ def fit_rest(record: Record, full: float, step: float, pad: Cells, living: Mask)
     none = np.zeros_like(usual)
     most = np.full_like(usual, np.inf)
     high = np.fmax.reduce(record.high)
-    rest = Rest(none, none, full, high, pad, usual, none, most, most, every, step)
+    rest = Rest(none, none, full, high, pad, usual, none, most, most, every, every, step)
     least = max(NARROW * full, 2 * step)
     level, _ = _lowest(record.mean, first, least)
     rest = replace(rest, level=level, near=least * usual)
@@ -310,11 +315,15 @@ def fit_rest(record: Record, full: float, step: float, pad: Cells, living: Mask)
     lowest = np.fmin.reduceat(without, first, axis=0)
     settles = (lowest <= level + near).mean(axis=0) >= _SETTLES
     rest = replace(rest, settles=settles)
+    at_once = replace(rest, pressed=~every).of_pads(record, living)
+    comes = at_once > rest.of_pads(record, living) + near
+    rest = replace(rest, pressed=comes.mean(axis=0) > 1 - _USUALLY)
     shared = rest.shared(record, living)
     above = rest.above(record, shared.offset)
     noise = np.maximum(rest.noise_of(record, above, living), _change(shared.drift, record))
     at_top = rest.share_at_top(record, above, living)
-    offsets = np.maximum(near, _usually(rest.of_pads(record, living)))
+    least = np.maximum(near, DITHER * full)
+    offsets = np.maximum(least, _usually(rest.of_pads(record, living)))
     drifts = _usually(replace(rest, drifts=none).drift(record, living))
     return replace(rest, noise=noise, offsets=offsets, drifts=drifts, at_top=at_top)
 
@@ -390,6 +399,16 @@ def _around(shared: Array, sure: Mask, record: Record) -> Array:
     after = np.where(coming <= end, shared[np.minimum(coming, n - 1)], np.inf)
     less = np.where(np.abs(before) <= np.abs(after), before, after)
     found: Array = np.where(np.isinf(less), 0, less)
+    return found
+
+
+def _throughout(shared: Array, sure: Mask, record: Record) -> Array:
+    """Return what a pad ``shared`` (``[n]``) at least in each recording, where it is ``sure``
+    (bool ``[n]``); 0: nowhere, or less."""
+    first = np.flatnonzero(record.first)
+    lowest = np.minimum.reduceat(np.where(sure, shared, np.inf), first)
+    lowest = np.where(np.isinf(lowest), 0, np.maximum(lowest, 0))
+    found: Array = np.repeat(lowest, np.diff(np.append(first, len(record))))
     return found
 
 

@@ -20,7 +20,7 @@ def pressed(seed: int, count: int) -> list[np.ndarray]:
             row, col = rng.uniform((0, 0), (2, 3))
             path = np.linspace(0, rng.uniform(-1, 1), 60)[:, None, None]
             away = (ROWS - row - path) ** 2 + (COLS - col + path) ** 2
-            grip = np.sin(np.linspace(0.1, np.pi - 0.1, 60))[:, None, None]
+            grip = np.maximum(np.sin(np.linspace(-0.5, np.pi + 0.5, 60)), 0)[:, None, None]
             frames[:, pad] += rng.uniform(80, 240) * grip * np.exp(-away / 4)
         found.append(np.clip(np.rint(frames), 0, 255).reshape(60, 24))
     return found

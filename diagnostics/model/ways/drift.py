@@ -18,7 +18,6 @@ from diagnostics.model.observed import Observed
 from diagnostics.model.over_time import Units, for_good, since
 from diagnostics.model.record import Array, Cells
 from diagnostics.model.symbols import root_load
-from diagnostics.model.ways.floats import no_more_than_floats
 from diagnostics.model.ways.way import Way, asked_once
 
 _REST = 12  # pieces: in so many a cell comes to rest
@@ -51,11 +50,11 @@ def _ratio(observed: Observed) -> Array:
 
 
 def _evidence(observed: Observed, units: Units) -> Array:
-    return no_more_than_floats(observed, units, lambda: for_good(_ratio(observed), units))
+    return for_good(_ratio(observed), units)
 
 
 def _since(observed: Observed, units: Units) -> Cells:
     return since(_ratio(observed), units)
 
 
-DRIFTS = Way(FaultKind.DRIFT, 0.05, _evidence, _since, decides=False)
+DRIFTS = Way(FaultKind.DRIFT, 0.05, _evidence, _since, decides=False, floats=True)

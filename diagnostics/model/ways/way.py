@@ -25,6 +25,8 @@ class Way:
         since: likeliest first piece of the fault, int ``[D]``; None: the first one.
         value: what is told of it, ``[D]``: a load, or frames; None: the reading at the end.
         decides: whether it tells who is trusted, in every round.
+        floats: whether such a cell moves by itself as well: there is no more evidence of it than of
+            that.
     """
 
     kind: FaultKind | None
@@ -33,6 +35,7 @@ class Way:
     since: Callable[[Observed, Units], Cells] | None = None
     value: Callable[[Observed], Array] | None = None
     decides: bool = True
+    floats: bool = False
 
 
 def asked_once(found: Callable[..., Array]) -> Callable[..., Array]:

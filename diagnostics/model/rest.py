@@ -49,6 +49,7 @@ _BLOCK = 64  # pieces of a recording that are looked at as one
 _AROUND = 7  # blocks that tell where a cell rests, at least
 _MEDIAN = 5  # of them, those that tell where its pad does
 _QUIET = 0.1  # quantile of the changes between two pieces: a cell that no load moves
+_QUIETEST = 0.25  # of the cells of a pad: noise is what all have
 _OF_DEVIATION = 0.178  # this quantile of a normal deviate's changes
 _USUALLY = 0.95  # of the pieces
 _NOISIER = 2.0  # times as noisy, or coarse, as the reference
@@ -262,7 +263,8 @@ class Rest:
         for pad in np.unique(self.pad).tolist():
             cells = (self.pad == pad) & telling
             if cells.sum() >= _FEWEST:
-                found[cells] = np.maximum(found[cells], _WITHIN * np.median(usual[cells]))
+                quiet = np.quantile(usual[cells], _QUIETEST)
+                found[cells] = np.maximum(found[cells], _WITHIN * quiet)
         return found
 
 

@@ -13,10 +13,11 @@ from diagnostics.decision.calibration import faulty_at
 from diagnostics.decision.judged import Judged
 from diagnostics.decision.root_causes import OF_WIRES, REFUTED_KINDS, CellFindings
 from diagnostics.evidence.stream_state import StreamState
-from diagnostics.faults import FaultKind
+from diagnostics.faults import Fault, FaultKind
 from diagnostics.layout import SensorLayout
 from diagnostics.model.judge import HELD, Judgement, Model
 from diagnostics.model.objects import judged_with_objects
+from diagnostics.model.observed import Log
 from diagnostics.model.record import Mask
 from diagnostics.model.symbols import NOTHING
 from diagnostics.model.ways import DRIFTS, WAYS
@@ -45,14 +46,9 @@ def judged_by_model(
     if stream.crosstalk is not None:
         log.disturbed[:] = True
     aliases, _ = find_aliasing(stream, partial(model.log_likelihood, log))
-    # what a pad shares looks alike on lines that nothing touches
     touched = (log.load > NOTHING).any(axis=0)
-    loaded = touched & ~log.disturbed
-    # lines of one cell each: which of the two is the copy is told by the model
-    aliases = [
-        fault for fault in aliases if loaded[list(fault.cells)].any() and len(fault.cells) > 2
-    ]
-    misread = np.zeros(len(loaded), bool)
+    aliases = [fault for fault in aliases if _reads_the_same_loads(fault, log)]
+    misread = np.zeros(layout.n_cells, bool)
     misread[[cell for fault in aliases for cell in fault.cells]] = True
     judgement, still = judged_with_objects(model, log, layout, misread)
     found = findings(judgement, stream, full_scale, rate)
@@ -70,6 +66,16 @@ def judged_by_model(
         contradicting=float(judgement.disturbed[model.present].mean()),
         pulled=partial(model.lines.pulled, judgement.observed),
     )
+
+
+def _reads_the_same_loads(alias: Fault, log: Log) -> bool:
+    """Return whether cells of two lines that always read the same are loaded meanwhile: what a pad
+    shares looks alike on lines that nothing touches. Of lines of one cell each the model tells
+    which of the two is the copy."""
+    cells = list(alias.cells)
+    since = log.record.begins >= (alias.onset or 0)
+    loaded = (log.load[:, cells] > NOTHING) & ~log.disturbed[cells]
+    return len(cells) > 2 and bool(loaded[since].any())
 
 
 def findings(

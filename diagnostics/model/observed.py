@@ -22,7 +22,7 @@ from diagnostics.model.symbols import (
 )
 
 _STAYS = 0.05  # of a root load, or of those of a pad: a smaller change is none
-_ODD = 5.0  # nats of a unit beyond those expected
+_ODD = 8.0  # nats of a unit beyond those expected
 _LOOKS = np.log([[0.95, 0.03, 0.02], [0.1, 0.88, 0.02]])  # of a held value without and with dither
 _USUALLY = 8.0  # cells that the usual look of a piece is worth
 _LEAST = 1e-6  # probability whose logarithm is taken

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from adaptfault.data.determination import explained
+from adaptfault.data.documents import members
 from adaptfault.evaluation.class_recall import ClassRecall, class_recalls
 from adaptfault.evaluation.scores import mean_interval, prediction_interval
 from diagnostics import FaultSet
@@ -177,16 +178,7 @@ class Forecast:
 
     def to_dict(self) -> dict[str, Any]:
         """Return a JSON-safe dict."""
-        return {
-            "schema": SCHEMA,
-            "fault_set": list(self.fault_set),
-            "stages": {name: asdict(expected) for name, expected in self.stages.items()},
-            "worst_class": self.worst_class,
-            "worst_loss": self.worst_loss,
-            "n_recordings": self.n_recordings,
-            "n_new": None if np.isinf(self.n_new) else self.n_new,
-            "classes": [one.to_dict() for one in self.classes],
-        }
+        return {"schema": SCHEMA, **members(self)}
 
 
 def _add_trained(stages: dict[str, Expected]) -> Expected:

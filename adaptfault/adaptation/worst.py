@@ -10,7 +10,7 @@ single wires alone, so the worst of all pairs may be missed.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from itertools import combinations
 from time import monotonic
 from typing import TYPE_CHECKING, Any
@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from adaptfault.adaptation.forecast import Expected
+from adaptfault.data.documents import members
 from diagnostics import FaultSet, SensorLayout
 from diagnostics.shown import shown
 
@@ -82,21 +83,12 @@ class WorstFaults:
         """Return a JSON-safe dict."""
         kinds = {
             name: [
-                {
-                    "what": loss.what,
-                    "cells": list(loss.fault_set),
-                    "expected": asdict(loss.expected),
-                }
+                {**members(loss, "what", "expected"), "cells": list(loss.fault_set)}
                 for loss in getattr(self, name)
             ]
             for name in ("wires", "pairs", "pads")
         }
-        return {
-            "schema": SCHEMA,
-            "layout": self.layout.to_dict(),
-            "fault_free": asdict(self.fault_free),
-            **kinds,
-        }
+        return {"schema": SCHEMA, **members(self, "layout", "fault_free"), **kinds}
 
     def plot(self) -> Any:
         """Draw what each cell costs with the worse of its two wires; return the matplotlib

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import os
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from adaptfault.bundle.checksummed_json import decoding, read_with_copy, write_with_copy
+from adaptfault.data.documents import members, rebuilt
 
 SCHEMA = "adaptfault.current/1"
 NAME = "current.json"
@@ -48,23 +49,13 @@ class Pointer:
     @classmethod
     def read(cls, bundle: Path) -> Pointer:
         """Read the pointer, or its copy where it is damaged; raises Damaged where both are."""
-        d = read_with_copy(bundle / NAME, SCHEMA)
+        document = read_with_copy(bundle / NAME, SCHEMA)
         with decoding(bundle / NAME):
-            rejected = tuple(tuple(map(int, cells)) for cells in d["rejected"])
-            fallbacks = tuple(map(int, d["fallbacks"]))
-            return cls(
-                active=int(d["active"]),
-                fallbacks=fallbacks,
-                probation=bool(d["probation"]),
-                starts=int(d["starts"]),
-                starter=str(d["starter"]),
-                rejected=rejected,
-                entry=str(d["entry"]),
-            )
+            return rebuilt(document, cls, schema=SCHEMA)
 
     def write(self, bundle: Path) -> None:
         """Write the pointer; replacing the file switches the version."""
-        write_with_copy(bundle / NAME, {"schema": SCHEMA, **asdict(self)})
+        write_with_copy(bundle / NAME, {"schema": SCHEMA, **members(self)})
 
     def deployed(self, number: int) -> Pointer:
         """Return the pointer to a new version, on probation. An unconfirmed version does not become

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from adaptfault.data.documents import members
 from diagnostics import SensorLayout
 from diagnostics.preprocessing.array_likes import is_array
 from diagnostics.shown import shown
@@ -77,19 +78,15 @@ class Summary:
         present = self.layout.present.ravel()
         return {
             "schema": SCHEMA,
-            "layout": self.layout.to_dict(),
+            **members(self, "layout", "step", "silent", "classes", "inferred"),
             "recordings": len(self.lengths),
             "frames": int(self.lengths.sum()),
             "seconds": self.duration,
             "lengths": {"least": int(self.lengths.min()), "most": int(self.lengths.max())},
             "lowest": _least(self.lowest[present]),
             "highest": _most(self.highest[present]),
-            "step": self.step,
             "rest": _median(self.rest[present]),
             "missing": int(self.missing[present].sum()),
-            "silent": self.silent.tolist(),
-            "classes": self.classes,
-            "inferred": list(self.inferred),
         }
 
     def __str__(self) -> str:

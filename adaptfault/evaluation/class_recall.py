@@ -4,12 +4,13 @@ for."""
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from adaptfault.data.documents import members, rebuilt
 from adaptfault.evaluation.scores import prediction_interval
 
 
@@ -49,25 +50,16 @@ class ClassRecall:
 
     def to_dict(self) -> dict[str, Any]:
         """Return a JSON-safe dict that :meth:`from_dict` reads."""
-        return asdict(self)
+        return members(self)
 
     @classmethod
     def from_dict(cls, d: Mapping[str, Any]) -> ClassRecall:
         """Build from the dict of :meth:`to_dict`.
 
         Raises:
-            KeyError, TypeError, ValueError: it is damaged.
+            ValueError: it is damaged.
         """
-        other = d["confused_with"]
-        return cls(
-            label=int(d["label"]),
-            recall=float(d["recall"]),
-            low=float(d["low"]),
-            high=float(d["high"]),
-            confused_with=None if other is None else int(other),
-            confused=float(d["confused"]),
-            n_recordings=int(d["n_recordings"]),
-        )
+        return rebuilt(d, cls)
 
 
 def class_recalls(

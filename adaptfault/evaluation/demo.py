@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from adaptfault.adaptation.adapter import Adapter
 from adaptfault.adaptation.result import Adaptation
+from adaptfault.data.documents import members
 from adaptfault.data.recordings import Recordings
 from adaptfault.data.windows import Windows, make_windows, scale, split
 from adaptfault.evaluation.scores import Scores, accuracy_interval
@@ -93,21 +94,11 @@ class DemoResult:
         """Return a JSON-safe dict."""
         return {
             "schema": "adaptfault.demo/1",
-            "seed": self.seed,
-            "layout": self.recordings.layout.to_dict(),
+            **members(self, "seed", "injected", "fault_free", "broken", "repaired", "intervals"),
+            **members(self, "recovered", "diagnosis", "false_alarms", "history", "seconds"),
+            **members(self.recordings, "layout", "class_names"),
+            **members(self.adaptation, "stages"),
             "recordings": len(self.recordings),
-            "class_names": list(self.recordings.class_names),
-            "injected": [fault.to_dict() for fault in self.injected],
-            "fault_free": self.fault_free.to_dict(),
-            "broken": self.broken.to_dict(),
-            "repaired": self.repaired.to_dict(),
-            "intervals": [list(interval) for interval in self.intervals],
-            "recovered": self.recovered,
-            "diagnosis": self.diagnosis.to_dict(),
-            "false_alarms": list(self.false_alarms),
-            "stages": [vars(stage) for stage in self.adaptation.stages],
-            "history": self.history.to_dict(),
-            "seconds": self.seconds,
         }
 
 

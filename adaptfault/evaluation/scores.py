@@ -13,6 +13,7 @@ from scipy.special import softmax
 from sklearn.metrics import confusion_matrix, precision_recall_fscore_support
 
 from adaptfault.data.determination import r2
+from adaptfault.data.documents import members, rebuilt
 from adaptfault.data.windows import Windows
 from diagnostics.shown import shown
 
@@ -98,9 +99,7 @@ class Scores:
 
     def to_dict(self) -> dict[str, Any]:
         """Return a JSON-safe dict that :meth:`from_dict` reads."""
-        d: dict[str, Any] = {"schema": SCHEMA}
-        d |= {name: getattr(self, name) for name in ("accuracy", "precision", "recall", "f1", "n")}
-        return d | {"confusion": self.confusion.tolist()}
+        return {"schema": SCHEMA, **members(self)}
 
     @classmethod
     def from_dict(cls, d: Mapping[str, Any]) -> Scores:
@@ -176,7 +175,7 @@ class ValueScores:
 
     def to_dict(self) -> dict[str, Any]:
         """Return a JSON-safe dict that :meth:`from_dict` reads."""
-        return {"schema": VALUES_SCHEMA, "r2": self.r2, "mae": list(self.mae), "n": self.n}
+        return {"schema": VALUES_SCHEMA, **members(self)}
 
     @classmethod
     def from_dict(cls, d: Mapping[str, Any]) -> ValueScores:
@@ -185,9 +184,7 @@ class ValueScores:
         Raises:
             ValueError: another schema.
         """
-        if d.get("schema") != VALUES_SCHEMA:
-            raise ValueError(f"expected schema {VALUES_SCHEMA!r}, got {d.get('schema')!r}")
-        return cls(d["r2"], tuple(d["mae"]), d["n"])
+        return rebuilt(d, cls, schema=VALUES_SCHEMA)
 
 
 def recording_scores(probabilities: ArrayLike, windows: Windows) -> Scores:

@@ -9,13 +9,14 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
+from adaptfault.data.documents import members
 from adaptfault.data.windows import Windows
 from adaptfault.evaluation.scores import Classifier
 from diagnostics import Line, SensorLayout
@@ -167,19 +168,7 @@ class Sensitivity:
 
     def to_dict(self) -> dict[str, Any]:
         """Return a JSON-safe dict."""
-        d: dict[str, Any] = {
-            "schema": SCHEMA,
-            "layout": self.layout.to_dict(),
-            "values": list(self.values),
-        }
-        d |= {"n": self.n, "accuracy": self.accuracy, "confidence": self.confidence}
-        for name in ("accuracy_lost", "confidence_lost", "gradient"):
-            d[name] = getattr(self, name).tolist()
-        for name in ("accuracy_lost_by_class", "confidence_lost_by_class"):
-            lost = getattr(self, name).astype(object)
-            lost[np.isnan(getattr(self, name))] = None
-            d[name] = lost.tolist()
-        return d | {"wires": [asdict(wire) for wire in self.wires]}
+        return {"schema": SCHEMA, **members(self)}
 
 
 def _place(layout: SensorLayout, cell: int) -> str:

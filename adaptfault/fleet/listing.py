@@ -9,7 +9,7 @@ import sys
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from datetime import date, datetime
 from pathlib import Path
 from string import Formatter
@@ -20,6 +20,7 @@ if sys.version_info >= (3, 11):
 else:
     import tomli as tomllib
 
+from adaptfault.data.documents import members
 from adaptfault.data.recordings.errors import InputError
 from adaptfault.data.recordings.facts.sizes import check_file
 
@@ -67,7 +68,7 @@ class Robot:
 
     def to_dict(self) -> dict[str, Any]:
         """Return a JSON-safe dict."""
-        return {**asdict(self), "recordings": list(self.recordings), "tags": list(self.tags)}
+        return members(self)
 
 
 @dataclass(frozen=True)

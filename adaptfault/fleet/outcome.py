@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
+from adaptfault.data.documents import rebuilt
 from adaptfault.fleet.listing import Robot
-from adaptfault.fleet.rebuild import rebuilt
 from adaptfault.robot.metrics import PadCells, RobotMetrics, cells_by_pad, summed
 
 if TYPE_CHECKING:  # passing outcomes on needs no torch
@@ -160,5 +160,4 @@ class Outcome:
         Raises:
             ValueError: a field is missing or of another type.
         """
-        outcome: Outcome = rebuilt(d, cls, {"Decision": str})
-        return outcome
+        return rebuilt(d, cls, {"Decision": str})

@@ -4,13 +4,15 @@ robots."""
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from datetime import date, datetime
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+from adaptfault.data.documents import members
 from adaptfault.fleet.outcome import Outcome
+from adaptfault.inspection.severity import STATUS
 from adaptfault.robot.metrics import RobotMetrics
 from adaptfault.robot.sensor_state import weak_base
 from diagnostics.shown import shown
@@ -178,7 +180,7 @@ class FleetReport:
         return sum(o.seconds for o in self.outcomes)
 
     def __str__(self) -> str:
-        status = ("OK", "WARNING", "CRITICAL", "UNKNOWN")[self.exit_code]
+        status = STATUS[self.exit_code]
         counts = ", ".join(f"{n} {state}" for state, n in self.counts.items() if n) or "none"
         measured = " ".join(
             f"{state}={n};;;0;{len(self.outcomes)}" for state, n in self.counts.items()
@@ -201,20 +203,11 @@ class FleetReport:
         """Return a JSON-safe dict."""
         return {
             "schema": SCHEMA,
-            "source": self.source,
-            "began": self.began,
-            "ended": self.ended,
-            "dry_run": self.dry_run,
-            "exit_code": self.exit_code,
-            "counts": self.counts,
+            **members(self),
+            **members(self, "exit_code", "counts", "wires", "families", "ages", "seconds"),
             "technician": [o.robot.name for o in self.technician],
             "weak_base_models": [o.robot.name for o in self.weak],
             "errors": {o.robot.name: o.reason for o in self.errors},
-            "wires": [asdict(wire) for wire in self.wires],
-            "families": self.families,
-            "ages": [asdict(group) for group in self.ages],
-            "seconds": self.seconds,
-            "outcomes": [o.to_dict() for o in self.outcomes],
         }
 
     def metrics(self) -> list[RobotMetrics]:

@@ -55,6 +55,9 @@ NAMES: tuple[str, ...] = get_args(Name)
 
 UNKNOWN = 3
 
+STATUS = ("OK", "WARNING", "CRITICAL", "UNKNOWN")
+"""The word of monitoring plugins for each severity."""
+
 UNREADABLE: tuple[Name, ...] = ("normalised", "silent_array")
 """Findings with which no reading means anything."""
 

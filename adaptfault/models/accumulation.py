@@ -22,6 +22,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import softmax
 
+from adaptfault.data.documents import members, rebuilt
+
 _REST = 0.1  # quantile of a cell's readings that is its reading without contact
 _BEGINS = 0.1  # load at which a contact begins, as a share of the median peak load of a recording
 _RELEASED = 0.3  # share of a contact's load that is left when it ends, as for contact events
@@ -80,11 +82,11 @@ class ContactStatistics:
     @classmethod
     def from_dict(cls, d: Mapping[str, Any]) -> ContactStatistics:
         """Build from the dict of :meth:`to_dict`."""
-        return cls(tuple(map(float, d["rest"])), float(d["begins"]), float(d["dependence"]))
+        return rebuilt(d, cls)
 
     def to_dict(self) -> dict[str, Any]:
         """Return a JSON-safe dict."""
-        return {"rest": list(self.rest), "begins": self.begins, "dependence": self.dependence}
+        return members(self)
 
 
 class ContactDecision:

@@ -6,6 +6,7 @@ import math
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal
 
+from adaptfault.data.documents import rebuilt
 from diagnostics.shown import shown
 
 Stopped = Literal["epochs", "patience", "budget"]
@@ -90,7 +91,4 @@ class History:
     @classmethod
     def from_dict(cls, d: dict[str, Any]) -> History:
         """Build a history from the dict of :meth:`to_dict`, also after JSON."""
-        fields: dict[str, Any] = {
-            name: tuple(value) if isinstance(value, list) else value for name, value in d.items()
-        }
-        return cls(**fields)
+        return rebuilt(d, cls)

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any, Literal
 
-from adaptfault.inspection.severity import Reason, worst
+from adaptfault.data.documents import members
+from adaptfault.inspection.severity import STATUS, Reason, worst
 from adaptfault.robot.model_comparison import Judgement
 from adaptfault.robot.routine import RoutineResult
 from adaptfault.robot.sensor_state import weak_base
@@ -97,7 +98,7 @@ class MaintenanceReport:
 
     def text(self, numbering: Numbering = _FROM_0) -> str:
         """Return the report as text; its first line is of the form of monitoring plugins."""
-        status = ("OK", "WARNING", "CRITICAL", "UNKNOWN")[self.exit_code]
+        status = STATUS[self.exit_code]
         n = self.n_cells or self.fault_set.n_cells
         faulty = len(self.fault_set)
         measured = [f"faulty={faulty};;;0;{n}"]
@@ -137,29 +138,6 @@ class MaintenanceReport:
 
     def to_dict(self) -> dict[str, Any]:
         """Return a JSON-safe dict."""
-        return {
-            "schema": SCHEMA,
-            "decision": self.decision,
-            "exit_code": self.exit_code,
-            "reason": self.reason,
-            "reasons": [asdict(reason) for reason in self.reasons],
-            "fault_set": list(self.fault_set),
-            "version": self.version,
-            "faults": [fault.to_dict() for fault in self.faults],
-            "diagnosis": None if self.diagnosis is None else self.diagnosis.to_dict(),
-            "judgement": None if self.judgement is None else self.judgement.to_dict(),
-            "accuracy": self.accuracy,
-            "fault_free_accuracy": self.fault_free_accuracy,
-            "measure": self.measure,
-            "set_size": self.set_size,
-            "change": None if self.change is None else vars(self.change),
-            "rewiring": list(self.rewiring),
-            "replaced_pads": list(self.replaced_pads),
-            "selftest": None if self.selftest is None else self.selftest.to_dict(),
-            "stages": list(self.stages),
-            "used": list(self.used),
-            "left_out": list(self.left_out),
-            "warnings": list(self.warnings),
-            "dry_run": self.dry_run,
-            "seconds": self.seconds,
-        }
+        document = {"schema": SCHEMA, **members(self), **members(self, "exit_code", "reason")}
+        del document["n_cells"]
+        return document

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from adaptfault.data.documents import members, rebuilt
 from diagnostics import Diagnosis, SensorLayout, Verdict
 from diagnostics.shown import shown
 
@@ -32,12 +33,22 @@ class Repertoire:
         gestures: recordings with one number repeat each other, as those of one class.
         loaded: the cells that each recording loaded, a bit a cell, hexadecimal.
         weights: what each cell matters, ``[D]``, of sum 1.
+
+    Raises:
+        ValueError: the recordings have another number of names, gestures or loads, or the loads
+            are of another number of cells.
     """
 
     names: tuple[str, ...]
     gestures: tuple[int, ...]
     loaded: tuple[str, ...]
     weights: tuple[float, ...]
+
+    def __post_init__(self) -> None:
+        if not len(self.names) == len(self.gestures) == len(self.loaded) > 0:
+            raise ValueError("names, gestures and loads of the repertoire differ in number")
+        if {len(bytes.fromhex(row)) for row in self.loaded} != {-(-len(self.weights) // 8)}:
+            raise ValueError("the loads of the repertoire do not fit its weights")
 
     @classmethod
     def from_loads(
@@ -69,25 +80,6 @@ class Repertoire:
             share[of_it] = loaded[of_it].mean(axis=0)
         likely: NDArray[np.float64] = (loaded + share) / 2
         return likely
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return a JSON-safe dict."""
-        return {name: list(values) for name, values in vars(self).items()}
-
-    @classmethod
-    def from_dict(cls, d: Mapping[str, Any]) -> Repertoire:
-        """Rebuild from :meth:`to_dict`; raises KeyError, TypeError or ValueError."""
-        made = cls(
-            tuple(map(str, d["names"])),
-            tuple(map(int, d["gestures"])),
-            tuple(map(str, d["loaded"])),
-            tuple(map(float, d["weights"])),
-        )
-        if not len(made.names) == len(made.gestures) == len(made.loaded) > 0:
-            raise ValueError("names, gestures and loads of the repertoire differ in number")
-        if {len(bytes.fromhex(row)) for row in made.loaded} != {-(-len(made.weights) // 8)}:
-            raise ValueError("the loads of the repertoire do not fit its weights")
-        return made
 
 
 @shown
@@ -157,15 +149,7 @@ class Routine:
 
     def to_dict(self) -> dict[str, Any]:
         """Return a JSON-safe dict that :meth:`from_dict` reads."""
-        return {
-            "schema": SCHEMA,
-            "recordings": list(self.recordings),
-            "names": list(self.names),
-            "tested": list(self.tested),
-            "reached": list(self.reached),
-            "seconds": self.seconds,
-            "repertoire": self.repertoire.to_dict(),
-        }
+        return {"schema": SCHEMA, **members(self)}
 
     @classmethod
     def from_dict(cls, d: Mapping[str, Any]) -> Routine:
@@ -177,16 +161,8 @@ class Routine:
         if not isinstance(d, Mapping) or d.get("schema") != SCHEMA:
             raise ValueError(f"expected a routine with schema {SCHEMA!r}")
         try:
-            before, after = map(float, d["tested"])
-            return cls(
-                tuple(map(int, d["recordings"])),
-                tuple(map(str, d["names"])),
-                (before, after),
-                tuple(map(float, d["reached"])),
-                float(d["seconds"]),
-                Repertoire.from_dict(d["repertoire"]),
-            )
-        except (KeyError, TypeError, ValueError) as error:
+            return rebuilt(d, cls, schema=SCHEMA)
+        except ValueError as error:
             raise ValueError(f"the routine is damaged: {error}") from None
 
     @classmethod
@@ -245,4 +221,4 @@ class RoutineResult:
 
     def to_dict(self) -> dict[str, Any]:
         """Return a JSON-safe dict."""
-        return {**vars(self), "untested": list(self.untested)}
+        return members(self)

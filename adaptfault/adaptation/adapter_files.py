@@ -15,8 +15,7 @@ from adaptfault.adaptation.adapter import Adapter
 from adaptfault.data.windows import Windows, evenly
 from adaptfault.imputation.statistics import CellStatistics
 from adaptfault.models.any_model import network_from_config
-from adaptfault.models.builders import ModelNotAllowed
-from adaptfault.models.store import Place, load_tensors, save_tensors
+from adaptfault.models.store import Place, check_rebuildable, load_tensors, save_tensors, undamaged
 
 SCHEMA = "adaptfault.adapter/1"
 WINDOWS_SCHEMA = "adaptfault.windows/1"
@@ -45,11 +44,7 @@ def save_adapter(path: Place, adapter: Adapter, *, limit: int | None = None) -> 
         ValueError: the smallest format does not fit, or the model can not be rebuilt (a module
             without builder).
     """
-    if "module" in adapter.model.config and adapter.model.config["builder"] is None:
-        raise ValueError(
-            f"{adapter.model.config['module']} cannot be rebuilt from a file: make it with"
-            " build_model('package.module:function', layout, n_classes)"
-        )
+    check_rebuildable(adapter.model.config)
     statistics = adapter.statistics
     upper = np.triu_indices(len(statistics.mean))
     tensors: dict[str, Tensor] = {
@@ -102,12 +97,8 @@ def save_windows(path: Place, windows: Windows, *, limit: int = LIMIT // 4) -> N
 def load_windows(path: Place) -> Windows:
     """Read windows written by :func:`save_windows`; raises the errors of :func:`load_adapter`."""
     about, tensors = load_tensors(path, WINDOWS_SCHEMA)
-    try:
+    with undamaged("windows", path):
         return _unpack(about["windows"], tensors, "windows")
-    except (KeyError, TypeError, ValueError, zlib.error) as error:
-        raise ValueError(
-            f"the windows in {path} are damaged: {str(error).splitlines()[0]}"
-        ) from None
 
 
 def load_adapter(path: Place) -> Adapter:
@@ -118,7 +109,7 @@ def load_adapter(path: Place) -> Adapter:
         ValueError: a file is damaged or of another kind.
     """
     about, tensors = load_tensors(path, SCHEMA)
-    try:
+    with undamaged("adapter", path):
         model = network_from_config(about["network"])
         model.load_state_dict(
             _restore({k.removeprefix("model."): v for k, v in tensors.items() if k[:6] == "model."})
@@ -136,12 +127,6 @@ def load_adapter(path: Place) -> Adapter:
         covariance = np.triu(covariance) + np.triu(covariance, 1).T
         frames = CellStatistics.reference(adapter.train)
         adapter.statistics = CellStatistics(tensors["statistics.mean"].numpy(), covariance, frames)
-    except ModelNotAllowed:
-        raise
-    except (KeyError, TypeError, ValueError, RuntimeError, zlib.error) as error:
-        raise ValueError(
-            f"the adapter in {path} is damaged: {str(error).splitlines()[0]}"
-        ) from None
     return adapter
 
 

@@ -18,7 +18,6 @@ from adaptfault.imputation.linear import AffineFill, NearestFill
 from adaptfault.imputation.tiled import TiledFill
 from adaptfault.models.accumulation import ContactStatistics
 from adaptfault.models.any_model import network_from_config
-from adaptfault.models.builders import ModelNotAllowed
 from adaptfault.models.heads import Head
 from adaptfault.models.network import logits_of
 from adaptfault.models.prediction_sets import PredictionSets
@@ -30,6 +29,7 @@ from adaptfault.models.store import (
     load_with_head,
     read_manifest,
     save_tensors,
+    undamaged,
 )
 from diagnostics import FaultSet
 from diagnostics.shown import shown
@@ -259,7 +259,7 @@ class Adaptation:
             ValueError: a file is damaged or of another kind, or ``network`` is needed.
         """
         about, tensors = load_tensors(path, ADAPTATION)
-        try:
+        with undamaged("adaptation", path):
             inner = network_from_config(about["network"], network, features)
             fault_set = FaultSet(tuple(about["fault_set"]), inner.layout.n_cells)
             front = _empty_front(about, fault_set)
@@ -274,12 +274,6 @@ class Adaptation:
             kept = about.get("sets")
             sets = None if kept is None else PredictionSets.from_dict(kept)
             recalls = tuple(ClassRecall.from_dict(one) for one in about.get("classes", ()))
-        except ModelNotAllowed:
-            raise
-        except (KeyError, TypeError, ValueError, RuntimeError) as error:
-            raise ValueError(
-                f"the adaptation in {path} is damaged: {str(error).splitlines()[0]}"
-            ) from None
         return cls(
             model.eval(),
             fault_set,

@@ -37,7 +37,7 @@ from adaptfault.bundle.signature import sign_versions, verify
 from adaptfault.bundle.versions import Version, Versions
 from adaptfault.data.atomic import make_folder, sync, sync_tree
 from adaptfault.data.shortage import is_shortage
-from adaptfault.models.store import InMemory
+from adaptfault.models.store import InMemory, check_names
 from diagnostics import FaultSet, SelfDiagnosis, SensorLayout
 
 if TYPE_CHECKING:
@@ -543,11 +543,7 @@ def _check_parts(
             f"model, adapter and diagnoser need one array shape; got {model.layout} and"
             f" {diagnoser.layout}"
         )
-    if class_names and len(class_names) != model.n_classes:
-        kinds = ("values", "value") if adapter.task == "regression" else ("classes", "class")
-        raise ValueError(
-            f"{model.n_classes} {kinds[0]} need as many {kinds[1]} names, got {len(class_names)}"
-        )
+    check_names(class_names, model.n_classes, adapter.task)
 
 
 def _more(windows: Windows) -> str:

@@ -32,10 +32,8 @@ _NUMBERED = 5  # worst cells that the map numbers
 _BATCH = 512  # stuck cells at once
 
 Floats = NDArray[np.float64]
-# windows [N, T, D] -> probability of each class [N, C]; window [T, D], cells [P], values [P] -> the
-# same, [P, C]
+# windows [N, T, D] -> probability of each class [N, C]
 _Answer = Callable[[NDArray[np.float32]], Floats]
-_StuckAnswers = Callable[[NDArray[np.float32], NDArray[np.intp], NDArray[np.float32]], Floats]
 
 
 @dataclass(frozen=True)
@@ -132,7 +130,7 @@ class Sensitivity:
                 f" {-present.max():+.3f} at worst; gradient estimate: rank correlation {rho:.2f}"
             )
         for cell, value, lost in self.worst():
-            lines.append(f"  {_place(self.layout, cell)} at {value:g}: {-lost:+.3f}")
+            lines.append(f"  {self.layout.place(cell)} at {value:g}: {-lost:+.3f}")
         return "\n".join([*lines, *(f"  {wire}" for wire in self.wires[:_NUMBERED])])
 
     def plot(self) -> Any:
@@ -169,10 +167,6 @@ class Sensitivity:
     def to_dict(self) -> dict[str, Any]:
         """Return a JSON-safe dict."""
         return {"schema": SCHEMA, **members(self)}
-
-
-def _place(layout: SensorLayout, cell: int) -> str:
-    return layout.place(cell)
 
 
 def sensitivity(
@@ -277,7 +271,7 @@ def _enumerate(
         raise ValueError("sensitivity needs labelled windows and at least one value to be stuck at")
     levels = np.asarray(values, np.float32)
     n_cells = windows.x.shape[2]
-    answer, stuck_answers, n_classes = _answers(model, windows)
+    answer, n_classes = _answers(model, windows)
     layout = getattr(model, "layout", None)
     present = layout.present.ravel() if isinstance(layout, SensorLayout) else np.ones(n_cells, bool)
     usual = _Tally(1, 1, n_classes)
@@ -290,7 +284,7 @@ def _enumerate(
         # A cell that reads the value already changes nothing.
         v, c = np.nonzero((window != levels[:, None, None]).any(1) & present)
         if len(c):
-            probability[v, c] = stuck_answers(window, c, levels[v])
+            probability[v, c] = _stuck(answer, window, c, levels[v])
         for label, count in labels.items():
             usual.add(own[None, None], label, count)
             stuck.add(probability, label, count)
@@ -307,8 +301,8 @@ def _distinct(windows: Windows) -> list[tuple[int, dict[int, int]]]:
     return list(alike.values())
 
 
-def _answers(model: Classifier | nn.Module, windows: Windows) -> tuple[_Answer, _StuckAnswers, int]:
-    """Return what maps windows, and one window with single cells stuck, to probabilities; and C."""
+def _answers(model: Classifier | nn.Module, windows: Windows) -> tuple[_Answer, int]:
+    """Return what maps windows to probabilities, and C."""
     from torch import nn
 
     from adaptfault.models.compact import CompactNetwork
@@ -336,25 +330,24 @@ def _answers(model: Classifier | nn.Module, windows: Windows) -> tuple[_Answer, 
         raise TypeError(
             f"expected something with predict(x) or a torch module, got {type(model).__name__}"
         )
-    return answer, _one_by_one(answer), n_classes
+    return answer, n_classes
 
 
-def _one_by_one(answer: _Answer) -> _StuckAnswers:
-    """Return a function that runs the classifier once for each stuck cell."""
-
-    def answers(
-        window: NDArray[np.float32], cells: NDArray[np.intp], levels: NDArray[np.float32]
-    ) -> Floats:
-        parts = []
-        for start in range(0, len(cells), _BATCH):
-            c = cells[start : start + _BATCH]
-            v = levels[start : start + _BATCH]
-            stuck = np.repeat(window[None], len(c), axis=0)
-            stuck[np.arange(len(c)), :, c] = v[:, None]
-            parts.append(answer(stuck))
-        return np.concatenate(parts)
-
-    return answers
+def _stuck(
+    answer: _Answer,
+    window: NDArray[np.float32],
+    cells: NDArray[np.intp],
+    levels: NDArray[np.float32],
+) -> Floats:
+    """Return the probabilities ``[P, C]`` of a window ``[T, D]`` with each of some cells stuck at
+    a level."""
+    parts = []
+    for start in range(0, len(cells), _BATCH):
+        c = cells[start : start + _BATCH]
+        stuck = np.repeat(window[None], len(c), axis=0)
+        stuck[np.arange(len(c)), :, c] = levels[start : start + _BATCH, None]
+        parts.append(answer(stuck))
+    return np.concatenate(parts)
 
 
 def _gradient(model: TactileTransformer, windows: Windows, values: Sequence[float]) -> Floats:
@@ -399,11 +392,8 @@ def _wires(
             if not len(cells):
                 continue
             p = answer(x)
-            accuracy = float((p.argmax(1) == windows.y).mean())
-            confidence = float(p[np.arange(len(x)), windows.y].mean())
-            lost = (
-                float(usual.accuracy[0, 0]) - accuracy,
-                float(usual.mean_confidence[0, 0]) - confidence,
-            )
+            accuracy = usual.accuracy[0, 0] - (p.argmax(1) == windows.y).mean()
+            confidence = usual.mean_confidence[0, 0] - p[np.arange(len(x)), windows.y].mean()
+            lost = float(accuracy), float(confidence)
             losses.append(WireLoss(line, float(value), len(cells), *lost))
     return tuple(sorted(losses, key=lambda wire: (-wire.accuracy_lost, -wire.confidence_lost)))

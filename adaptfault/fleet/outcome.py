@@ -18,6 +18,9 @@ if TYPE_CHECKING:  # passing outcomes on needs no torch
 
     Decision = Decided | Literal["error"]
 
+NAMES = {"Decision": str}
+"""What names of types stand for that only a type checker imports."""
+
 _NOTES = 5
 
 
@@ -160,4 +163,4 @@ class Outcome:
         Raises:
             ValueError: a field is missing or of another type.
         """
-        return rebuilt(d, cls, {"Decision": str})
+        return rebuilt(d, cls, NAMES)

@@ -15,11 +15,12 @@ from tqdm import tqdm
 
 from adaptfault.bundle.bundle import now
 from adaptfault.bundle.lock import locked
+from adaptfault.data.documents import rebuilt
 from adaptfault.data.json_lines import Lines
 from adaptfault.fleet.engines import engine
 from adaptfault.fleet.guard import Task
 from adaptfault.fleet.listing import Fleet, Robot
-from adaptfault.fleet.outcome import Outcome
+from adaptfault.fleet.outcome import NAMES, Outcome
 from adaptfault.fleet.work import maintain_robot, ready
 
 if TYPE_CHECKING:
@@ -123,17 +124,21 @@ def maintain_fleet(
 class _Head:
     """The first line of a ledger: the options and the begin of the run."""
 
-    schema: str
-    options: dict[str, Any]
+    options: dict  # type: ignore[type-arg]  # of any content
     began: str
 
 
 @dataclass(frozen=True)
 class _Entry:
-    """A further line: the outcome of a robot; None: the end of the run."""
+    """A further line: the outcome of a robot, or the end of the run."""
 
     time: str
-    outcome: Outcome | None
+    outcome: Outcome | None = None
+    ended: bool = False
+
+    def __post_init__(self) -> None:
+        if (self.outcome is None) != self.ended:
+            raise ValueError("expected an outcome, or the end")
 
 
 def _resumed(lines: Lines, fleet: Fleet, options: dict[str, Any]) -> tuple[str, dict[str, Outcome]]:
@@ -147,17 +152,17 @@ def _resumed(lines: Lines, fleet: Fleet, options: dict[str, Any]) -> tuple[str, 
         return "", {}
     number = 1
     try:
-        head = _head(documents[0])
+        head = rebuilt(documents[0], _Head, schema=SCHEMA)
         last = _time(head.began)
         entries = []
         for document in documents[1:]:
             number += 1
-            entries.append(_entry(document))
+            entries.append(rebuilt(document, _Entry, NAMES))
             last = _time(entries[-1].time)
     except ValueError as error:
         what = f"no line of a ledger ({error}); remove the file, or give another --out"
         raise ValueError(f"{lines.path}, line {number}: {what}") from None
-    over = any(entry.outcome is None for entry in entries)
+    over = any(entry.ended for entry in entries)
     if over or head.options != options or datetime.now(timezone.utc) - last > _OVER:
         return "", {}
     # A robot whose paths changed is processed again.
@@ -170,28 +175,8 @@ def _resumed(lines: Lines, fleet: Fleet, options: dict[str, Any]) -> tuple[str, 
     return head.began, done
 
 
-def _head(document: Any) -> _Head:
-    """Return the first line of a ledger; raises ValueError."""
-    if not isinstance(document, dict) or document.get("schema") != SCHEMA:
-        raise ValueError(f"expected the schema {SCHEMA!r}")
-    if set(document) != {"schema", "options", "began"} or type(document["options"]) is not dict:
-        raise ValueError("expected schema, options and began")
-    return _Head(**document)
-
-
-def _entry(document: Any) -> _Entry:
-    """Return a further line of a ledger; raises ValueError."""
-    if not isinstance(document, dict) or "time" not in document:
-        raise ValueError("expected a time")
-    if document.keys() == {"time", "ended"}:
-        return _Entry(document["time"], None)
-    return _Entry(document["time"], Outcome.from_dict(document.get("outcome", {})))
-
-
-def _time(text: Any) -> datetime:
+def _time(text: str) -> datetime:
     """Return a time with its zone; raises ValueError."""
-    if not isinstance(text, str):
-        raise ValueError(f"expected a time, got {str(text)[:60]!r}")
     time = datetime.fromisoformat(text)
     if time.tzinfo is None:
         raise ValueError(f"expected a time with its zone, got {text!r}")

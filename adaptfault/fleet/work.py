@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
+from typing import Any
 
 from adaptfault.bundle.lock import Busy
 from adaptfault.fleet.listing import Robot
@@ -39,7 +40,9 @@ def maintain_robot(
         sign: PEM file of the private key that signs the bundle after the run; None: it is not
             signed.
     """
-    work = partial(_maintained, robot, dry_run, budget, keys, least_serial, sign)
+    whose = {"keys": keys, "least_serial": least_serial}
+    how = {"dry_run": dry_run, "budget": budget, "sign": sign}
+    work = partial(_maintained, robot, whose, how)
     began = time.perf_counter()
     try:
         with _one_thread():
@@ -62,28 +65,15 @@ def _patiently(work: Callable[[float], Outcome], began: float) -> Outcome:
 
 
 def _maintained(
-    robot: Robot,
-    dry_run: bool,
-    budget: float | None,
-    keys: Sequence[str] | None,
-    least_serial: int,
-    sign: str | None,
-    began: float,
+    robot: Robot, whose: Mapping[str, Any], how: Mapping[str, Any], began: float
 ) -> Outcome:
     from adaptfault.bundle.bundle import Bundle
     from adaptfault.robot.maintenance import maintain
     from adaptfault.robot.new_recordings import load_new_recordings
 
-    bundle = Bundle.open(robot.bundle, keys=keys, least_serial=least_serial)
+    bundle = Bundle.open(robot.bundle, **whose)
     incoming = load_new_recordings(bundle, robot.paths())
-    report = maintain(
-        bundle,
-        incoming.frames,
-        names=incoming.names,
-        dry_run=dry_run,
-        budget=budget,
-        sign=sign,
-    )
+    report = maintain(bundle, incoming.frames, names=incoming.names, **how)
     notes = tuple(problem.message for problem in incoming.problems if problem.level == "error")
     return Outcome.of(robot, bundle, report, notes=notes, seconds=time.perf_counter() - began)
 

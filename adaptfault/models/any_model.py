@@ -7,20 +7,18 @@ import copy
 from collections.abc import Callable, Mapping
 from typing import Any
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from adaptfault.models.builders import ModelNotAllowed, build_model, builder_of, first_line
-from adaptfault.models.network import TactileTransformer, logits_of
+from adaptfault.models.network import TactileTransformer, WindowModel, evaluating
 from diagnostics import SensorLayout
 
 Features = str | Callable[[nn.Module, Tensor], Tensor]
 _PROBE = 3  # windows of the test run; not 1 or 2, so that a batch axis in another place is noticed
 
 
-class AnyModel(nn.Module):
+class AnyModel(WindowModel):
     """A module from windows ``[N, T, D]`` to outputs ``[N, n]``, with the attributes that an
     adaptation needs.
 
@@ -85,7 +83,8 @@ class AnyModel(nn.Module):
             of.register_forward_hook(lambda of, _, out: used.append((of, out))) for of in linear
         ]
         try:
-            outputs = _evaluate(module, lambda: module(x))
+            with evaluating(module):
+                outputs = module(x)
         except Exception as error:  # a model may raise anything
             raise ValueError(
                 f"{name} fails on windows of shape {shape}: {first_line(error)}; an adapter needs a"
@@ -122,7 +121,8 @@ class AnyModel(nn.Module):
             return
         name = type(self.module).__name__
         try:
-            found: Any = _evaluate(self, lambda: self.features(x))
+            with evaluating(self):
+                found: Any = self.features(x)
             shape = list(found.shape) if isinstance(found, Tensor) else type(found).__name__
             problem = (
                 None
@@ -192,16 +192,6 @@ class AnyModel(nn.Module):
         """Map windows ``[N, T, D]`` on the 0..1 scale to outputs ``[N, n]``."""
         outputs: Tensor = self.module(x)
         return outputs
-
-    def predict(self, x: NDArray[Any]) -> NDArray[np.int64]:
-        """Return the class of each window ``[N, T, D]``, int64 ``[N]``."""
-        classes: NDArray[np.int64] = logits_of(self, x).argmax(1).numpy()
-        return classes
-
-    def predict_proba(self, x: NDArray[Any]) -> NDArray[np.float32]:
-        """Return the probability of each class for windows ``[N, T, D]``, float32 ``[N, n]``."""
-        probabilities: NDArray[np.float32] = logits_of(self, x).softmax(1).numpy()
-        return probabilities
 
     @property
     def config(self) -> dict[str, Any]:
@@ -297,15 +287,3 @@ def device_of(module: nn.Module) -> torch.device:
 
 def _trainable(layer: nn.Module) -> bool:
     return any(p.requires_grad for p in layer.parameters(recurse=False))
-
-
-def _evaluate(module: nn.Module, run: Callable[[], Any]) -> Any:
-    """Run in eval mode without gradients, and restore the mode of each submodule."""
-    modes = [(of, of.training) for of in module.modules()]
-    module.eval()
-    try:
-        with torch.no_grad():
-            return run()
-    finally:
-        for of, mode in modes:
-            of.training = mode

@@ -3,7 +3,8 @@ any tactile array."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any, Literal
 
 import numpy as np
@@ -82,7 +83,22 @@ def attend(qkv: Tensor) -> Tensor:
     return attended.transpose(1, 2).flatten(2)
 
 
-class TactileTransformer(nn.Module):
+class WindowModel(nn.Module):
+    """A module from windows ``[N, T, D]`` on the 0..1 scale to outputs ``[N, n]``."""
+
+    def predict(self, x: Batch) -> NDArray[np.int64]:
+        """Return the class of each window ``[N, T, D]``, int64 ``[N]``."""
+        classes: NDArray[np.int64] = logits_of(self, x).argmax(1).numpy()
+        return classes
+
+    def predict_proba(self, x: Batch) -> NDArray[np.float32]:
+        """Return the probability of each class for windows ``[N, T, D]``, float32
+        ``[N, n]``."""
+        probabilities: NDArray[np.float32] = logits_of(self, x).softmax(1).numpy()
+        return probabilities
+
+
+class TactileTransformer(WindowModel):
     """Classifier of tactile windows, Section III-A, for any layout.
 
     The pads are the channels of the convolutions, which see each frame alone; attention runs over
@@ -227,17 +243,6 @@ class TactileTransformer(nn.Module):
         logits: Tensor = self.head(self.dropout(self.features(x)))
         return logits
 
-    def predict(self, x: Batch) -> NDArray[np.int64]:
-        """Return the class of each window ``[N, T, D]``, int64 ``[N]``."""
-        classes: NDArray[np.int64] = logits_of(self, x).argmax(1).numpy()
-        return classes
-
-    def predict_proba(self, x: Batch) -> NDArray[np.float32]:
-        """Return the probability of each class for windows ``[N, T, D]``, float32
-        ``[N, n_classes]``."""
-        probabilities: NDArray[np.float32] = logits_of(self, x).softmax(1).numpy()
-        return probabilities
-
     @property
     def config(self) -> dict[str, Any]:
         """Arguments of :meth:`from_config` that rebuild this network without its weights;
@@ -273,12 +278,20 @@ def logits_of(model: nn.Module, x: Batch, *, batch_size: int = 256) -> Tensor:
     """
     windows = x if isinstance(x, Tensor) else as_tensor(np.asarray(x, dtype=np.float32))
     device = next((p.device for p in model.parameters()), windows.device)
+    batches = torch.split(windows, batch_size) if len(windows) else (windows,)
+    with evaluating(model):
+        return torch.cat([model(batch.to(device, torch.float32)).cpu() for batch in batches])
+
+
+@contextmanager
+def evaluating(model: nn.Module) -> Iterator[None]:
+    """Put a module into eval mode, without gradients; each of its modules returns to its earlier
+    mode."""
     modes = [(module, module.training) for module in model.modules()]
     model.eval()
     try:
         with torch.no_grad():
-            batches = torch.split(windows, batch_size) if len(windows) else (windows,)
-            return torch.cat([model(batch.to(device, torch.float32)).cpu() for batch in batches])
+            yield
     finally:
         for module, mode in modes:
             module.training = mode

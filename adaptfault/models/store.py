@@ -6,7 +6,9 @@ from __future__ import annotations
 import hashlib
 import json
 import re
-from collections.abc import Mapping, Sequence
+import zlib
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
@@ -15,6 +17,7 @@ from typing import TYPE_CHECKING, Any, Literal, Protocol
 import numpy as np
 
 from adaptfault.data.atomic import atomic_write
+from adaptfault.models.builders import ModelNotAllowed
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -307,16 +310,8 @@ def save_model(
         ValueError: another number of names than classes or values, a module without builder, or
             ``extra`` does not fit into JSON.
     """
-    if class_names and len(class_names) != model.n_classes:
-        kinds = ("values", "value") if task == "regression" else ("classes", "class")
-        raise ValueError(
-            f"{model.n_classes} {kinds[0]} need as many {kinds[1]} names, got {len(class_names)}"
-        )
-    if "module" in model.config and model.config["builder"] is None:
-        raise ValueError(
-            f"{model.config['module']} cannot be rebuilt from a file: make it with"
-            " build_model('package.module:function', layout, n_classes)"
-        )
+    check_names(class_names, model.n_classes, task)
+    check_rebuildable(model.config)
     about = {
         "config": model.config,
         "task": task,
@@ -328,6 +323,34 @@ def save_model(
         about["head"] = head.about
         tensors |= {_HEAD + name: tensor for name, tensor in head.state_dict().items()}
     save_tensors(folder, SCHEMA, about, tensors)
+
+
+def check_names(names: Sequence[str], n: int, task: str) -> None:
+    """Raise ValueError where there are names, and not one for each of n classes or values."""
+    if names and len(names) != n:
+        many, one = ("values", "value") if task == "regression" else ("classes", "class")
+        raise ValueError(f"{n} {many} need as many {one} names, got {len(names)}")
+
+
+def check_rebuildable(config: Mapping[str, Any]) -> None:
+    """Raise ValueError where the model of a configuration is a module without a builder."""
+    if "module" in config and config["builder"] is None:
+        raise ValueError(
+            f"{config['module']} cannot be rebuilt from a file: make it with"
+            " build_model('package.module:function', layout, n_classes)"
+        )
+
+
+@contextmanager
+def undamaged(what: str, folder: Place) -> Iterator[None]:
+    """Raise ValueError for any error in decoding what a folder holds."""
+    try:
+        yield
+    except ModelNotAllowed:
+        raise
+    except (KeyError, TypeError, ValueError, AttributeError, RuntimeError, zlib.error) as error:
+        first = str(error).splitlines()[0]
+        raise ValueError(f"the {what} in {folder} is damaged: {first}") from None
 
 
 def load_model(folder: Place) -> TactileTransformer | AnyModel:
@@ -347,11 +370,10 @@ def load_with_head(folder: Place) -> tuple[TactileTransformer | AnyModel, Head |
     Raises the errors of :func:`load_model`.
     """
     from adaptfault.models.any_model import network_from_config
-    from adaptfault.models.builders import ModelNotAllowed
     from adaptfault.models.heads import Head
 
     manifest, tensors = load_tensors(folder, SCHEMA)
-    try:
+    with undamaged("model", folder):
         model = network_from_config(manifest["config"])
         head = None
         if (about := manifest.get("head")) is not None:
@@ -360,10 +382,4 @@ def load_with_head(folder: Place) -> tuple[TactileTransformer | AnyModel, Head |
                 {k.removeprefix(_HEAD): v for k, v in tensors.items() if k.startswith(_HEAD)}
             )
         model.load_state_dict({k: v for k, v in tensors.items() if not k.startswith(_HEAD)})
-    except ModelNotAllowed:
-        raise
-    except (KeyError, TypeError, ValueError, RuntimeError) as error:
-        raise ValueError(
-            f"the model in {folder} is damaged: {str(error).splitlines()[0]}"
-        ) from None
     return model.eval(), head

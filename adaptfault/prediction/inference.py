@@ -12,7 +12,13 @@ from numpy.typing import NDArray
 
 from adaptfault.models.accumulation import ContactStatistics
 from adaptfault.models.prediction_sets import PredictionSets
-from adaptfault.models.store import ADAPTATION, Place, read_attached, read_manifest
+from adaptfault.models.store import (
+    ADAPTATION,
+    Place,
+    read_attached,
+    read_manifest,
+    undamaged,
+)
 from diagnostics import FaultSet, SensorLayout
 
 if TYPE_CHECKING:
@@ -82,7 +88,7 @@ class Inference:
                 f"unknown runtime {runtime!r}: use one of {', '.join(get_args(Runtime))}"
             )
         manifest = read_manifest(folder, ADAPTATION)
-        try:
+        with undamaged("adaptation", folder):
             network = manifest["network"]
             layout = SensorLayout.from_dict(network["layout"])
             fault_set = FaultSet(tuple(manifest["fault_set"]), layout.n_cells)
@@ -95,8 +101,6 @@ class Inference:
             task = manifest.get("task", "classification")
             if task not in ("classification", "regression"):
                 raise ValueError(f"unknown task {task!r}")
-        except (KeyError, TypeError, ValueError, AttributeError) as error:
-            raise ValueError(f"the adaptation in {folder} is damaged: {error}") from None
         exported = "onnx" in manifest
         if runtime is None:
             runtime = "onnx" if exported and find_spec("onnxruntime") else "torch"

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptfault.data.recordings.errors import NO_FRAMES, InputError, Problem, located
+from adaptfault.data.recordings.errors import NO_FRAMES, InputError, Problem
 from adaptfault.data.recordings.facts.infer import GIVE_LAYOUT, SLACK, describe_width
 from adaptfault.data.recordings.facts.rates import Elapsed
 from adaptfault.data.recordings.survey import Content
@@ -86,7 +86,7 @@ def check_readings(
                 f"{count} {name} reading{'s' * (count != 1)}, first in {first[name]}: {kept_as} as"
                 " missing"
             )
-            problems.append(Problem("warning", located(content.path, what)))
+            problems.append(Problem.warning(content.path, what))
     return kept, problems
 
 
@@ -101,7 +101,7 @@ def _disorder(content: Content, i: int, elapsed: Elapsed) -> list[Problem]:
         what = f"{times} before the one before, first in {content.where(i, elapsed.first_fall)}"
         what += ": the clock was reset, or the frames are not in order; kept as they stand"
         found.append(what)
-    return [Problem("warning", located(content.path, what)) for what in found]
+    return [Problem.warning(content.path, what) for what in found]
 
 
 def check_scale(
@@ -137,7 +137,7 @@ def check_scale(
     if largest >= 0.1 * layout.full_scale:
         return []
     what = f"the largest reading is {largest:.4g} {expected}; is it the same unit?"
-    return [Problem("warning", located(Path(path), what))]
+    return [Problem.warning(Path(path), what)]
 
 
 def without_infinite(frames: NDArray[Any]) -> NDArray[Any]:
@@ -187,7 +187,7 @@ class OutOfRange:
             f" {self.layout.unit}, first in {self.first}, the farthest {self.extreme:g}: kept; if"
             " they are real, the layout's full scale is wrong"
         )
-        return Problem("warning", located(self.content.path, what))
+        return Problem.warning(self.content.path, what)
 
 
 def out_of_range(found: list[Problem], files: int, layout: SensorLayout) -> list[Problem]:
@@ -233,7 +233,7 @@ def other_lengths(contents: Sequence[Content]) -> list[Problem]:
                 f"{_rows(content, length)} where the others have {common}: kept; windows use whole"
                 " windows only"
             )
-            problems.append(Problem("warning", located(content.path, what)))
+            problems.append(Problem.warning(content.path, what))
     return problems
 
 

@@ -58,6 +58,11 @@ class Problem:
     level: Literal["error", "warning"]
     message: str
 
+    @classmethod
+    def warning(cls, path: str | PathLike[str], what: str, where: str = "") -> Problem:
+        """Return a warning about a file, at a place in it."""
+        return cls("warning", located(path, what, where))
+
     def __str__(self) -> str:
         return f"{self.level}: {self.message}"
 

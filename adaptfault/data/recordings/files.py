@@ -121,4 +121,4 @@ def passed_over(notes: Sequence[Path]) -> list[Problem]:
         return []
     more = f", and {len(notes) - 1} more" if len(notes) > 1 else ""
     what = f"is no recording, it holds no line of numbers: passed over{more}"
-    return [Problem("warning", located(notes[0], what))]
+    return [Problem.warning(notes[0], what)]

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptfault.data.recordings.errors import Problem, located
+from adaptfault.data.recordings.errors import Problem
 from adaptfault.data.recordings.facts.labels import natural_order, read_label_table
 from adaptfault.data.recordings.survey import Content
 
@@ -44,7 +44,7 @@ def label_files(
         elif file.root not in nested or not file.is_direct:
             label = file.path.resolve().parent.name
         if label is None:
-            problems.append(Problem("warning", located(file.path, remedy)))
+            problems.append(Problem.warning(file.path, remedy))
         else:
             labelled.append(replace(content, labels=(label,) * len(content.recordings)))
     return labelled

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from adaptfault.data.recordings.errors import InputError, Problem, located
+from adaptfault.data.recordings.errors import InputError, Problem
 from adaptfault.data.recordings.recording import Shape
 from adaptfault.data.recordings.survey import Content
 from diagnostics import SensorLayout
@@ -243,7 +243,7 @@ def _paper_scale(largest: float, content: Content) -> Scale:
             "no reading exceeds 1: taken as newtons of 0..5; if they are scaled to 0..1 already, as"
             " the paper stores them, give the full scale 1 (--full-scale 1; full_scale=1 in Python)"
         )
-        problems = (Problem("warning", located(content.path, what)),)
+        problems = (Problem.warning(content.path, what),)
     return Scale(
         PAPER.full_scale, PAPER.unit, f"the paper's sensor; largest reading {largest:.4g}", problems
     )
@@ -267,7 +267,7 @@ def _converter_scale(largest: float, content: Content) -> Scale:
         full_scale,
         "count",
         reason,
-        (Problem("warning", located(content.path, f"{what}; {GIVE_SCALE}")),),
+        (Problem.warning(content.path, f"{what}; {GIVE_SCALE}"),),
     )
 
 

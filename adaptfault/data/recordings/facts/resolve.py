@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from adaptfault.data.printable import printable
-from adaptfault.data.recordings.errors import InputError, Problem, located
+from adaptfault.data.recordings.errors import InputError, Problem
 from adaptfault.data.recordings.facts.infer import (
     default_unit,
     infer_scale,
@@ -190,7 +190,7 @@ def _without_rows(contents: Sequence[Content], shape: Shape) -> list[Problem]:
         f" pads without rows, so that a broken row or column shows as single cells; give --shape"
         f" {pads}x{sides(cells)}, or {pads}x1x{cells} if they have none"
     )
-    return [Problem("warning", located(told[0].path, what))]
+    return [Problem.warning(told[0].path, what)]
 
 
 def _measured_rate(contents: Sequence[Content]) -> tuple[float | None, str]:
@@ -247,7 +247,7 @@ def _contradicted(
         return []
     what = f"the file states 0..{content.facts.full_scale:g} {content.facts.unit or ''}".rstrip()
     used = f"0..{layout.full_scale:g} {layout.unit} is used, as the option or layout states"
-    return [Problem("warning", located(content.path, f"{what}, but {used}"))]
+    return [Problem.warning(content.path, f"{what}, but {used}")]
 
 
 def _first(values: Iterable[Any]) -> Any:

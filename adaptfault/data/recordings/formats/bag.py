@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptfault.data.recordings.errors import InputError, Problem, located
+from adaptfault.data.recordings.errors import InputError, Problem
 from adaptfault.data.recordings.facts.labels import natural_key
 from adaptfault.data.recordings.facts.sizes import check_kind
 from adaptfault.data.recordings.formats.bag_fields import Found, Topic, choose
@@ -81,7 +81,7 @@ def open(
             others += 1
     if others:
         what = f"{others} messages hold another number of readings than the first, {width}"
-        problems.append(Problem("warning", located(path, f"{what}: left out")))
+        problems.append(Problem.warning(path, f"{what}: left out"))
     stamps = np.sort(np.array(times))
     facts = Facts(
         path,
@@ -237,4 +237,4 @@ def _salvaged(asked: _Asked, reason: str, problems: list[Problem]) -> Iterator[M
     names = ", ".join(one.name for one in frames.topics)
     what = f"damaged or cut off: {read} messages of {names}, {(last - first) / 1e9:.1f} s, could"
     told = [f"{n} damaged {one}{'s' * (n != 1)} left out" for one, n in lost.items() if n]
-    problems.append(Problem("warning", located(path, "; ".join([f"{what} be read", *told, *ends]))))
+    problems.append(Problem.warning(path, "; ".join([f"{what} be read", *told, *ends])))

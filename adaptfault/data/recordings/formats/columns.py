@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptfault.data.recordings.errors import InputError, Problem, located
+from adaptfault.data.recordings.errors import InputError, Problem
 from adaptfault.data.recordings.facts.roles import (
     EPISODES,
     LABELS,
@@ -130,7 +130,7 @@ def choose_columns(
         ticks = _clock_of(path, dialect, even=wanted is not None or not fills)
         if ticks is not None:
             roles = replace(roles, clock=0, unit=ticks or None)
-            problems = (Problem("warning", located(path, _TAKEN)),)
+            problems = (Problem.warning(path, _TAKEN),)
     aside = {*ignored, roles.clock, roles.label, roles.episode}
     readings = [i for i in readings if i not in aside]
     if wanted is None:

@@ -27,7 +27,7 @@ from typing import Any
 
 import numpy as np
 
-from adaptfault.data.recordings.errors import InputError, Problem, located
+from adaptfault.data.recordings.errors import InputError, Problem
 from adaptfault.data.recordings.facts.sizes import LONGEST_LINE
 from adaptfault.data.recordings.formats.columns import Columns, Names, choose_columns
 from adaptfault.data.recordings.formats.dialect import (
@@ -104,7 +104,7 @@ def open(
         return matrices(path, dialect)
     held = choose_columns(path, dialect, columns, ignore, time_column, label_column, shape)
     spans, division = spans_of(path, dialect, held)
-    lost = (Problem("warning", located(path, division.lost)),) if division.lost else ()
+    lost = (Problem.warning(path, division.lost),) if division.lost else ()
     facts = Facts(
         path,
         text=True,
@@ -199,7 +199,7 @@ def _parse(path: Path, data: bytes, before: _Before, dialect: Dialect, columns: 
         and (len(written) < len(data) or _is_cut(rows[-1], above, dialect))
     ):
         what = "cut off in this line: the lines before it are kept"
-        problems = (Problem("warning", located(path, what, f"line {before.lines + numbers[-1]}")),)
+        problems = (Problem.warning(path, what, f"line {before.lines + numbers[-1]}"),)
         rows = rows[:-1]
         numbers = numbers[:-1]
     has_comments = any(mark in text for mark in COMMENTS)

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptfault.data.recordings.errors import InputError, Problem, located
+from adaptfault.data.recordings.errors import InputError, Problem
 from adaptfault.data.recordings.formats.columns import Columns
 from adaptfault.data.recordings.formats.dialect import (
     Dialect,
@@ -96,7 +96,7 @@ def matrix_blocks(path: Path, dialect: Dialect) -> Iterator[Block]:
         is_short = len(frame) < dialect.rows or len(dialect.split(frame[-1][1])) < dialect.width
         if is_last and whole and is_short:
             what = "cut off in this frame: the frames before it are kept"
-            problems = (Problem("warning", located(path, what, at)),)
+            problems = (Problem.warning(path, what, at),)
             break
         if len(frame) != dialect.rows:
             what = (

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from adaptfault.data.atomic import atomic_write
 from adaptfault.data.printable import printable
 from adaptfault.data.recordings.dataset import Recordings
-from adaptfault.data.recordings.errors import InputError, Problem, located
+from adaptfault.data.recordings.errors import InputError, Problem
 from adaptfault.data.recordings.facts.sizes import check_archive, check_array
 from adaptfault.data.recordings.formats.datasets.beside import Stated
 from adaptfault.data.recordings.formats.datasets.contents import Contents, Opened, texts
@@ -102,7 +102,7 @@ def open(path: Path, *, shape: Shape | None = None, **stated: Any) -> list[Recor
     for key, value in numbers.items():
         if isinstance(value, str):
             what = f"{key} is {shown(value)}, no number: ignored"
-            problems = (*problems, Problem("warning", located(path.with_suffix(".json"), what)))
+            problems = (*problems, Problem.warning(path.with_suffix(".json"), what))
     facts = replace(
         facts,
         class_names=class_names,

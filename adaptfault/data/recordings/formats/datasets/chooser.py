@@ -23,7 +23,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptfault.data.recordings.errors import InputError, Problem, located
+from adaptfault.data.recordings.errors import InputError, Problem
 from adaptfault.data.recordings.facts.episodes import Division, Episode, numbered
 from adaptfault.data.recordings.facts.labels import natural_key
 from adaptfault.data.recordings.facts.roles import (
@@ -292,7 +292,7 @@ class Chooser:
         if len(left_out) > _SHOWN:
             told.append(f"{len(left_out) - _SHOWN} more arrays are left out for such reasons")
         for what in told:
-            yield Problem("warning", located(self.path, what))
+            yield Problem.warning(self.path, what)
 
     def parts(self, episodes: Sequence[tuple[str, list[str]]]) -> Iterator[Part]:
         """Yield the recordings in the arrays of each episode."""

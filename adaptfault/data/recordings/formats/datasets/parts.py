@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptfault.data.recordings.errors import InputError, Problem, foreseeing, located
+from adaptfault.data.recordings.errors import InputError, Problem, foreseeing
 from adaptfault.data.recordings.formats.datasets.axes import TimeLast, Vector
 from adaptfault.data.recordings.formats.datasets.contents import (
     TEXTS,
@@ -135,7 +135,7 @@ def _block(path: Path, frames: NDArray[Any], stamps: NDArray[Any] | None, held: 
             stamps = np.array(texts(stamps), dtype="datetime64[ns]")
         except ValueError:
             what = f"{held.part.clock} holds texts that are no times, as {texts(stamps)[0]!r}"
-            problem = Problem("warning", located(path, f"{what}: passed over"))
+            problem = Problem.warning(path, f"{what}: passed over")
             return Block(frames, problems=(problem,))
     if stamps.dtype.kind in TIMES:
         unset = np.isnat(stamps)

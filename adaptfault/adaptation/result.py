@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from adaptfault.adaptation.reduced_model import ReducedModel, phi
 from adaptfault.data.windows import Windows, finite_windows
 from adaptfault.evaluation.class_recall import ClassRecall, class_recalls
-from adaptfault.evaluation.scores import Scores, ValueScores
+from adaptfault.evaluation.scores import Scores, ValueScores, scored
 from adaptfault.imputation.linear import AffineFill, NearestFill
 from adaptfault.imputation.tiled import TiledFill
 from adaptfault.models.accumulation import ContactStatistics
@@ -124,12 +124,7 @@ class Adaptation:
             return self._scores
         if self._validation is None:
             raise ValueError("this adaptation was loaded without scores")
-        outputs = self._outputs(self._validation)
-        if self.task == "regression":
-            return ValueScores.of(self._validation.y, outputs.numpy())
-        return Scores.of(
-            self._validation.y, outputs.argmax(1).numpy(), n_classes=self.model.network.n_classes
-        )
+        return scored(self._validation.y, self._outputs(self._validation).numpy())
 
     def _outputs(self, validation: Windows) -> Tensor:
         """Return the outputs for the validation windows, computed once."""

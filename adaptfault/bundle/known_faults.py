@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from adaptfault.data.documents import check_schema
 from diagnostics import Diagnosis, Fault, FaultKind, FaultSet, Verdict
 
 SCHEMA = "adaptfault.knowledge/1"
@@ -93,7 +94,6 @@ class KnownFaults:
         Raises:
             ValueError: another schema.
         """
-        if d.get("schema") != SCHEMA:
-            raise ValueError(f"expected schema {SCHEMA!r}, got {d.get('schema')!r}")
+        check_schema(d, SCHEMA)
         proofs = {int(cell): n for cell, n in d["proofs"].items()}
         return cls(d["n_cells"], tuple(Fault.from_dict(f) for f in d["faults"]), proofs)

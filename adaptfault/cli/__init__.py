@@ -20,30 +20,32 @@ __path__ = extend_path(__path__, __name__)  # the packages of the repository add
 
 GROUP = "adaptfault.commands"
 
-BUILT_IN = {
-    "info": "adaptfault.cli.info",
-    "check": "adaptfault.cli.check",
-    "explain": "adaptfault.cli.explain",
-    "convert": "adaptfault.cli.convert",
-    "view": "adaptfault.cli.view",
-    "simulate": "adaptfault.cli.simulate",
-    "diagnose": "adaptfault.cli.diagnose",
-    "selftest": "adaptfault.cli.selftest",
-    "train": "adaptfault.cli.train",
-    "evaluate": "adaptfault.cli.evaluate",
-    "predict": "adaptfault.cli.predict",
-    "forecast": "adaptfault.cli.forecast",
-    "adapt": "adaptfault.cli.adapt",
-    "restore": "adaptfault.cli.restore",
-    "demo": "adaptfault.cli.demo",
-    "maintain": "adaptfault.cli.maintain",
-    "rollback": "adaptfault.cli.rollback",
-    "history": "adaptfault.cli.history",
-    "report": "adaptfault.cli.report",
-    "listen": "adaptfault.cli.listen",
-    "fleet": "adaptfault.cli.fleet",
-    "reproduce": "adaptfault.cli.reproduce",
-}
+_NAMES = (
+    "info",
+    "check",
+    "explain",
+    "convert",
+    "view",
+    "simulate",
+    "diagnose",
+    "selftest",
+    "train",
+    "evaluate",
+    "predict",
+    "forecast",
+    "adapt",
+    "restore",
+    "demo",
+    "maintain",
+    "rollback",
+    "history",
+    "report",
+    "listen",
+    "fleet",
+    "reproduce",
+)
+
+BUILT_IN = {name: f"adaptfault.cli.{name}" for name in _NAMES}
 """The commands in the order of ``--help``, as the entry points of the repository name them. Another
 package adds one by a module with ``add(subparsers)`` and an entry point in the same group."""
 

@@ -27,10 +27,9 @@ class History(Trusting):
 
     def run(self) -> int:
         """List runs and versions."""
-        from adaptfault.bundle.bundle import Bundle
         from adaptfault.bundle.pointer import Pointer
 
-        bundle = Bundle.open(self.bundle, **self.trusted())
+        bundle = self.opened(self.bundle)
         if self.picture and not self.trend:
             raise ValueError("--picture shows trends: give --trend, too")
         if self.confirm:

@@ -63,13 +63,12 @@ add = Maintain.add
 def _maintain(args: Maintain) -> int:
     import sys
 
-    from adaptfault.bundle.bundle import Bundle
     from adaptfault.robot.maintenance import maintain
     from adaptfault.robot.new_recordings import load_new_recordings
     from adaptfault.robot.routine import Routine
 
     routine = None if args.after is None else Routine.read(args.after)
-    bundle = Bundle.open(args.bundle, **args.trusted())
+    bundle = args.opened(args.bundle)
     incoming = load_new_recordings(bundle, args.recordings)
     args.tell_problems(incoming.problems)
     report = maintain(

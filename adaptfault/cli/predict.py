@@ -3,7 +3,7 @@ bundle runs."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from adaptfault.cli.command import option
@@ -12,9 +12,8 @@ from adaptfault.cli.reading import Reading
 from adaptfault.cli.shared_options import Trusting, chosen_device, device_option
 
 if TYPE_CHECKING:
-    from adaptfault.cli.trained_model import TrainedModel
-    from adaptfault.data.recordings import Recordings
-    from adaptfault.data.windows import Windows
+    import numpy as np
+    from numpy.typing import NDArray
 
 
 class Predict(Trusting, Reading):
@@ -33,11 +32,8 @@ class Predict(Trusting, Reading):
     def run(self) -> int:
         """Predict; the probabilities of a recording are those of
         :func:`adaptfault.evaluation.scores.of_recording`, its values the mean over its windows."""
-        import numpy as np
-
         from adaptfault.cli.trained_model import TrainedModel
         from adaptfault.data.windows import make_windows
-        from adaptfault.evaluation.scores import of_recording
 
         trained = TrainedModel.open(self, str(self.model or self.bundle))
         if self.calibration is None and trained.calibration is not None:
@@ -48,69 +44,60 @@ class Predict(Trusting, Reading):
         )
         trained.adaptation.model.to(chosen_device(self.device))
         if trained.is_regression:
-            return _values(self, trained, recordings, windows)
-        probabilities = trained.adaptation.predict_proba(windows.x)
-        names = trained.class_names or tuple(f"class {i}" for i in range(probabilities.shape[1]))
+            kind, of_recording, table = "value", _values, _table_of_values
+            outputs = trained.adaptation.predict(windows.x)
+        else:
+            kind, of_recording, table = "class", _class, _table_of_classes
+            outputs = trained.adaptation.predict_proba(windows.x)
+        names = trained.class_names or tuple(f"{kind} {i}" for i in range(outputs.shape[1]))
         results = []
         for i, name in enumerate(recordings.names):
-            own = probabilities[windows.recording == i]
-            mean = of_recording(own) if len(own) else None
-            results.append(
-                {
-                    "recording": name,
-                    "class": None if mean is None else names[int(mean.argmax())],
-                    "probability": None if mean is None else float(mean.max()),
-                    "windows": len(own),
-                    "agreeing_windows": 0
-                    if mean is None
-                    else int(np.sum(own.argmax(axis=1) == mean.argmax())),
-                    "label": None
-                    if recordings.labels is None
-                    else recordings.class_names[recordings.labels[i]],
-                }
-            )
+            own = outputs[windows.recording == i]
+            about = {"recording": name, **of_recording(own, names), "windows": len(own)}
+            if kind == "class":
+                labels = recordings.labels
+                about["label"] = None if labels is None else recordings.class_names[labels[i]]
+            results.append(about)
         result = {
             "schema": "adaptfault.predict/1",
             "layout": recordings.layout.to_dict(),
-            "class_names": list(names),
+            f"{kind}_names": list(names),
             "fault_set": list(trained.adaptation.fault_set),
             "predictions": results,
         }
-        self.emit(result, _table(results))
+        self.emit(result, table(results, names))
         return 0
 
 
 add = Predict.add
 
 
-def _values(args: Predict, trained: TrainedModel, recordings: Recordings, windows: Windows) -> int:
-    """Print the values of each recording."""
-    predicted = trained.adaptation.predict(windows.x)
-    names = trained.class_names or tuple(f"value {i}" for i in range(predicted.shape[1]))
-    results: list[dict[str, Any]] = []
-    for i, name in enumerate(recordings.names):
-        own = predicted[windows.recording == i]
-        mean = own.mean(axis=0).tolist() if len(own) else None
-        results.append(
-            {"recording": name, "values": mean, "windows": len(own), "each": own.tolist()}
-        )
-    result = {
-        "schema": "adaptfault.predict/1",
-        "layout": recordings.layout.to_dict(),
-        "value_names": list(names),
-        "fault_set": list(trained.adaptation.fault_set),
-        "predictions": results,
-    }
+def _class(own: NDArray[np.float32], names: Sequence[str]) -> dict[str, Any]:
+    """Return what the probabilities of the windows of a recording say of it."""
+    from adaptfault.evaluation.scores import of_recording
+
+    if not len(own):
+        return {"class": None, "probability": None, "agreeing_windows": 0}
+    mean = of_recording(own)
+    best = int(mean.argmax())
+    agreeing = int((own.argmax(axis=1) == best).sum())
+    return {"class": names[best], "probability": float(mean[best]), "agreeing_windows": agreeing}
+
+
+def _values(own: NDArray[np.float32], names: Sequence[str]) -> dict[str, Any]:
+    """Return the values of a recording, and of each of its windows."""
+    return {"values": own.mean(axis=0).tolist() if len(own) else None, "each": own.tolist()}
+
+
+def _table_of_values(results: Sequence[Mapping[str, Any]], names: Sequence[str]) -> str:
+    """Return one line a recording: name, values, windows."""
     rows = [("recording", *names, "windows")]
     for one in results:
-        shown = (
-            ["shorter than a window"]
-            if one["values"] is None
-            else [*(f"{value:.4g}" for value in one["values"]), str(one["windows"])]
-        )
+        shown = ["shorter than a window"]
+        if one["values"] is not None:
+            shown = [*(f"{value:.4g}" for value in one["values"]), str(one["windows"])]
         rows.append((one["recording"], *shown, *[""] * (len(names) + 1 - len(shown))))
-    args.emit(result, _aligned(rows))
-    return 0
+    return _aligned(rows)
 
 
 def _aligned(rows: Sequence[tuple[str, ...]]) -> str:
@@ -122,7 +109,7 @@ def _aligned(rows: Sequence[tuple[str, ...]]) -> str:
     )
 
 
-def _table(results: list[dict[str, object]]) -> str:
+def _table_of_classes(results: Sequence[Mapping[str, Any]], names: Sequence[str]) -> str:
     """Return one line a recording: name, class, probability, windows, and the label where there is
     one."""
     labelled = any(result["label"] is not None for result in results)

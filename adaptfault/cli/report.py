@@ -19,10 +19,9 @@ class Report(Trusting):
 
     def run(self) -> int:
         """Write the page."""
-        from adaptfault.bundle.bundle import Bundle
         from adaptfault.robot.technician_report import write_report
 
-        bundle = Bundle.open(self.bundle, **self.trusted())
+        bundle = self.opened(self.bundle)
         path = write_report(self.out, bundle, name=self.name, count_from=self.count_from)
         self.emit({"schema": "adaptfault.report/1", "report": str(path)}, f"report: {path}")
         return 0

@@ -36,13 +36,12 @@ class Restore(Trusting):
         """Restore the faulty cells and missing readings of each recording."""
         import numpy as np
 
-        from adaptfault.bundle.bundle import Bundle
         from adaptfault.cli.diagnoses import fault_set
         from adaptfault.data.atomic import atomic_write
         from adaptfault.data.recordings import Recordings, save_npz
         from adaptfault.robot.new_recordings import load_new_recordings
 
-        bundle = Bundle.open(self.bundle, **self.trusted())
+        bundle = self.opened(self.bundle)
         layout = bundle.layout
         faults = (
             bundle.known_faults().fault_set

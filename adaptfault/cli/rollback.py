@@ -16,10 +16,9 @@ class Rollback(Trusting):
 
     def run(self) -> int:
         """Roll back."""
-        from adaptfault.bundle.bundle import Bundle
         from adaptfault.robot.sensor_state import SensorState
 
-        bundle = Bundle.open(self.bundle, **self.trusted())
+        bundle = self.opened(self.bundle)
         left = bundle.active().number
         version = bundle.rollback()
         unhandled = [fault.reason for fault in SensorState.of(bundle).unhandled]

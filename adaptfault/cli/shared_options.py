@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import argparse
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from adaptfault.cli.command import Command, argument, option
 from adaptfault.cli.paths import Read, Stated, Written
+
+if TYPE_CHECKING:
+    from adaptfault.bundle.bundle import Bundle
 
 
 class Trusting(Command):
@@ -38,6 +41,16 @@ class Trusting(Command):
         if self.least_serial is not None and not self.trust:
             raise ValueError("--least-serial needs --trust KEY")
         return {"keys": self.keys or None, "least_serial": self.least_serial or 0}
+
+    def opened(self, folder: str) -> Bundle:
+        """Return the bundle in a folder.
+
+        Raises:
+            FileNotFoundError, ValueError: there is none, damaged, or not signed by a trusted key.
+        """
+        from adaptfault.bundle.bundle import Bundle
+
+        return Bundle.open(folder, **self.trusted())
 
 
 def sign_option(when: str, **how: Any) -> Any:

@@ -186,11 +186,8 @@ def open_bundle(args: Trusting, folder: str) -> Bundle | None:
         FileNotFoundError, ValueError: the bundle is damaged or not signed by a trusted key; or no
         bundle, with --trust.
     """
-    trusted = args.trusted()
-    if not is_bundle(folder):
-        if trusted["keys"]:
-            raise ValueError(f"--trust: {folder} is no bundle, and only bundles are signed")
-        return None
-    from adaptfault.bundle.bundle import Bundle
-
-    return Bundle.open(folder, **trusted)
+    if is_bundle(folder):
+        return args.opened(folder)
+    if args.trusted()["keys"]:
+        raise ValueError(f"--trust: {folder} is no bundle, and only bundles are signed")
+    return None

@@ -53,12 +53,17 @@ def rebuilt(
             another type.
     """
     if schema is not None:
-        found = value.get("schema") if isinstance(value, Mapping) else None
-        if found != schema:
-            raise ValueError(f"expected schema {schema!r}, got {found!r}")
+        check_schema(value, schema)
         value = {name: held for name, held in value.items() if name != "schema"}
     made: T = _rebuilt(value, kind, names)
     return made
+
+
+def check_schema(document: Any, schema: str) -> None:
+    """Raise ValueError unless a document states a schema."""
+    found = document.get("schema") if isinstance(document, Mapping) else None
+    if found != schema:
+        raise ValueError(f"expected schema {schema!r}, got {found!r}")
 
 
 def _rebuilt(value: Any, kind: Any, names: Mapping[str, Any] | None) -> Any:

@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import Literal
 
-from adaptfault.evaluation.html_page import Picture, render, version_of
+from adaptfault.evaluation.html_page import Picture, render
 from diagnostics import Diagnosis
 from diagnostics.decision.grouped_faults import by_group
 from diagnostics.decision.numbering import Numbering
@@ -104,5 +104,4 @@ def write_diagnosis(
         numbering=Numbering.from_layout(diagnosis.layout, count_from),
         verdicts=Picture.of(partial(diagnosis.plot, count_from=count_from)),
         date=datetime.now().astimezone().strftime("%Y-%m-%d %H:%M %Z"),
-        versions=f"adaptfault {version_of('adaptfault')}",
     )

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import base64
 import io
-from collections.abc import Callable
+import platform
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -22,8 +23,11 @@ _NARROW = 4.5
 """Width of a page on a telephone, in inches: its letters are then legible."""
 
 
-def render(path: str | Path, template: str, **values: Any) -> Path:
-    """Render a template of the package into a file; return the path.
+def render(
+    path: str | Path, template: str, *, packages: Sequence[str] = ("adaptfault",), **values: Any
+) -> Path:
+    """Render a template of the package into a file, with the versions of packages; return the
+    path.
 
     Raises:
         OSError: the folder cannot be written.
@@ -37,6 +41,8 @@ def render(path: str | Path, template: str, **values: Any) -> Path:
     environment.filters["legend"] = legend
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
+    values["versions"] = ", ".join(f"{name} {version_of(name)}" for name in packages)
+    values["python"] = platform.python_version()
     atomic_write(path, environment.get_template(template).render(values).encode())
     return path
 

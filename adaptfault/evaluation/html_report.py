@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import platform
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from adaptfault.evaluation.html_page import Picture, render, version_of
+from adaptfault.evaluation.html_page import Picture, render
 from diagnostics import FaultSet
 from diagnostics.decision.plot import draw_forces, pads_figure
 
@@ -46,11 +45,7 @@ def write_report(path: str | Path, result: DemoResult) -> Path:
         alarms=_false_alarm_texts(result),
         forces=Picture.of(lambda page: _draw_maps(result, page)),
         verdicts=Picture.of(result.diagnosis.plot),
-        versions=", ".join(
-            f"{name} {version_of(name)}"
-            for name in ("adaptfault", "torch", "numpy", "scikit-learn")
-        ),
-        python=platform.python_version(),
+        packages=("adaptfault", "torch", "numpy", "scikit-learn"),
     )
 
 

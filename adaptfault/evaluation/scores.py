@@ -13,7 +13,7 @@ from scipy.special import softmax
 from sklearn.metrics import confusion_matrix, precision_recall_fscore_support
 
 from adaptfault.data.determination import r2
-from adaptfault.data.documents import members, rebuilt
+from adaptfault.data.documents import check_schema, members, rebuilt
 from adaptfault.data.windows import Windows
 from diagnostics.shown import shown
 
@@ -108,8 +108,7 @@ class Scores:
         Raises:
             ValueError: another schema.
         """
-        if d.get("schema") != SCHEMA:
-            raise ValueError(f"expected schema {SCHEMA!r}, got {d.get('schema')!r}")
+        check_schema(d, SCHEMA)
         confusion = np.asarray(d["confusion"], dtype=np.int64)
         confusion.setflags(write=False)
         return cls(d["accuracy"], d["precision"], d["recall"], d["f1"], confusion, d["n"])
@@ -330,14 +329,12 @@ def prediction_interval(
     return float(np.clip(low, 0.0, p)), float(np.clip(high, p, 1.0))
 
 
-def _evaluate_values(model: Any, windows: Windows) -> ValueScores:
-    from torch import nn
-
-    from adaptfault.models.network import logits_of
-
-    if isinstance(model, nn.Module):
-        return ValueScores.of(windows.y, logits_of(model, windows.x).numpy())
-    return ValueScores.of(windows.y, model.predict(windows.x))
+def scored(true: ArrayLike, outputs: NDArray[Any]) -> Scores | ValueScores:
+    """Score outputs ``[N, n]``: as values against true ones ``[N, n]``, or as logits or
+    probabilities of the classes ``[N]``."""
+    if np.ndim(true) == 2:
+        return ValueScores.of(true, outputs)
+    return Scores.of(true, outputs.argmax(1), n_classes=outputs.shape[1])
 
 
 def evaluate(model: Classifier | Any, windows: Windows) -> Any:
@@ -353,18 +350,18 @@ def evaluate(model: Classifier | Any, windows: Windows) -> Any:
         ValueError: no windows, or windows without labels.
         TypeError: ``model`` is neither.
     """
-    n_classes = getattr(model, "n_classes", None)
-    if windows.y.ndim == 2:
-        return _evaluate_values(model, windows)
-    if callable(getattr(model, "predict", None)):
-        return Scores.of(windows.y, model.predict(windows.x), n_classes=n_classes)
-    from torch import nn  # a plain classifier is scored without torch
+    predict = getattr(model, "predict", None)
+    if callable(predict) and windows.y.ndim == 1:  # a plain classifier is scored without torch
+        n_classes = getattr(model, "n_classes", None)
+        return Scores.of(windows.y, predict(windows.x), n_classes=n_classes)
+    from torch import nn
 
     from adaptfault.models.network import logits_of
 
-    if not isinstance(model, nn.Module):
-        raise TypeError(
-            f"expected something with predict(x) or a torch module, got {type(model).__name__}"
-        )
-    logits = logits_of(model, windows.x)
-    return Scores.of(windows.y, logits.argmax(1).numpy(), n_classes=logits.shape[1])
+    if isinstance(model, nn.Module):
+        return scored(windows.y, logits_of(model, windows.x).numpy())
+    if callable(predict):
+        return ValueScores.of(windows.y, predict(windows.x))
+    raise TypeError(
+        f"expected something with predict(x) or a torch module, got {type(model).__name__}"
+    )

@@ -221,17 +221,9 @@ class FleetReport:
         Raises:
             OSError: the file cannot be written.
         """
-        import platform
+        from adaptfault.evaluation.html_page import render
 
-        from adaptfault.evaluation.html_page import render, version_of
-
-        return render(
-            path,
-            "fleet.html",
-            report=self,
-            versions=f"adaptfault {version_of('adaptfault')}",
-            python=platform.python_version(),
-        )
+        return render(path, "fleet.html", report=self)
 
 
 def _group(years: int, outcomes: list[Outcome]) -> AgeGroup:

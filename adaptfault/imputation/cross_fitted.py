@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -47,3 +48,18 @@ class CrossFitted:
         weight, bias = self._whole.conditional_mean(fault_set)
         bias = mean + correction.gain * (bias - mean) + correction.offset
         return correction.gain[:, None] * weight, bias, correction.deviation
+
+
+def by_missing(
+    missing: NDArray[np.bool_],
+) -> Iterator[tuple[NDArray[np.intp], NDArray[np.bool_]]]:
+    """Yield the frames of ``missing [n, D]`` that lack the same cells, and which these are, bool
+    ``[D]``; frames that lack none are left out."""
+    rows = np.flatnonzero(missing.any(axis=1))
+    if not len(rows):
+        return
+    _, first, group = np.unique(
+        np.packbits(missing[rows], axis=1), axis=0, return_index=True, return_inverse=True
+    )
+    for number, mask in enumerate(missing[rows[first]]):
+        yield rows[group.ravel() == number], mask

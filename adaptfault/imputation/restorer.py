@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from adaptfault.data.windows import evenly, hold_missing, scale
-from adaptfault.imputation.cross_fitted import CrossFitted
+from adaptfault.imputation.cross_fitted import CrossFitted, by_missing
 from adaptfault.imputation.recalibration import two_folds
 from adaptfault.imputation.tiled_statistics import LARGE, TiledStatistics
 from diagnostics import FaultSet, SensorLayout
@@ -115,19 +115,11 @@ class Restorer:
         frames = np.array(self.layout.check_recording(recording), dtype=np.float64)
         missing = self._missing(frames, fault_set)
         deviation = np.zeros_like(frames)
-        rows = np.flatnonzero(missing.any(axis=1))
-        if len(rows):
-            _, first, group = np.unique(
-                np.packbits(missing[rows], axis=1), axis=0, return_index=True, return_inverse=True
-            )
-            for number, mask in enumerate(missing[rows[first]]):
-                of = rows[group.ravel() == number]
-                for part in self._plan(mask):
-                    healthy = frames[np.ix_(of, part.known)].astype(np.float32)
-                    frames[np.ix_(of, part.missing)] = self._clip(
-                        healthy @ part.weight.T + part.bias
-                    )
-                    deviation[np.ix_(of, part.missing)] = part.deviation
+        for of, mask in by_missing(missing):
+            for part in self._plan(mask):
+                healthy = frames[np.ix_(of, part.known)].astype(np.float32)
+                frames[np.ix_(of, part.missing)] = self._clip(healthy @ part.weight.T + part.bias)
+                deviation[np.ix_(of, part.missing)] = part.deviation
         return (frames, deviation) if return_std else frames
 
     def update(self, frame: ArrayLike, fault_set: Cells | None = None) -> Floats:

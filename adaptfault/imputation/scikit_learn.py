@@ -20,7 +20,7 @@ from sklearn.model_selection import GroupKFold, KFold, StratifiedGroupKFold, Str
 from sklearn.utils.metaestimators import available_if
 from sklearn.utils.validation import check_is_fitted, validate_data
 
-from adaptfault.imputation.cross_fitted import CrossFitted
+from adaptfault.imputation.cross_fitted import CrossFitted, by_missing
 from diagnostics import FaultSet
 from diagnostics.faults import Cells
 
@@ -75,15 +75,7 @@ class CellImputer(OneToOneFeatureMixin, TransformerMixin, BaseEstimator):  # typ
         x = validate_data(
             self, X, dtype=np.float64, ensure_all_finite="allow-nan", reset=False, copy=True
         )
-        missing = np.isnan(x)
-        rows = np.flatnonzero(missing.any(axis=1))
-        if not len(rows):
-            return np.asarray(x)
-        _, first, group = np.unique(
-            np.packbits(missing[rows], axis=1), axis=0, return_index=True, return_inverse=True
-        )
-        for number, mask in enumerate(missing[rows[first]]):
-            of = rows[group.ravel() == number]
+        for of, mask in by_missing(np.isnan(x)):
             weight, bias, _ = self._map(mask)
             healthy = ((x[of] - self.mean_) / self._scale)[:, ~mask]
             x[np.ix_(of, mask)] = (healthy @ weight.T + bias) * self._scale[mask] + self.mean_[mask]

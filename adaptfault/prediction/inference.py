@@ -4,6 +4,7 @@ on torch."""
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
@@ -31,41 +32,31 @@ Runtime = Literal["onnx", "torch"]
 _BATCH = 16
 
 
+@dataclass(eq=False)
 class Inference:
     """A classifier, or a regression, of whole windows, adapted to F.
 
     Attributes:
+        run: maps windows ``[N, T, D]`` to outputs ``[N, n_classes]``.
+        runtime: "onnx" or "torch".
         layout: the array whose windows it takes.
+        fault_set: F; the readings of its cells cannot reach the output, not even NaN or infinity.
         length: T, frames in a window.
         n_classes: number of classes, or of values.
-        task: "classification" or "regression".
-        fault_set: F; the readings of its cells cannot reach the output, not even NaN or infinity.
-        runtime: "onnx" or "torch".
         contact: for decisions about whole contacts.
+        task: "classification" or "regression".
         sets: for sets of classes; None: stored without.
     """
 
-    def __init__(
-        self,
-        run: Callable[[NDArray[np.float32]], NDArray[np.float32]],
-        runtime: Runtime,
-        layout: SensorLayout,
-        fault_set: FaultSet,
-        length: int,
-        n_classes: int,
-        contact: ContactStatistics | None = None,
-        task: Literal["classification", "regression"] = "classification",
-        sets: PredictionSets | None = None,
-    ) -> None:
-        self.sets = sets
-        self.contact = ContactStatistics.unknown(layout.n_cells) if contact is None else contact
-        self._run = run
-        self.runtime = runtime
-        self.layout = layout
-        self.fault_set = fault_set
-        self.length = length
-        self.n_classes = n_classes
-        self.task = task
+    run: Callable[[NDArray[np.float32]], NDArray[np.float32]]
+    runtime: Runtime
+    layout: SensorLayout
+    fault_set: FaultSet
+    length: int
+    n_classes: int
+    contact: ContactStatistics
+    task: Literal["classification", "regression"] = "classification"
+    sets: PredictionSets | None = None
 
     @classmethod
     def load(cls, folder: Place, *, runtime: Runtime | None = None) -> Inference:
@@ -95,7 +86,9 @@ class Inference:
             length = int(network["length"])
             n_classes = int(network["n_classes"])
             stored = manifest.get("contact")
-            contact = None if stored is None else ContactStatistics.from_dict(stored)
+            contact = ContactStatistics.unknown(layout.n_cells)
+            if stored is not None:
+                contact = ContactStatistics.from_dict(stored)
             kept = manifest.get("sets")
             sets = None if kept is None else PredictionSets.from_dict(kept)
             task = manifest.get("task", "classification")
@@ -155,7 +148,7 @@ class Inference:
             raise ValueError(
                 f"expected windows [N, {self.length}, {self.layout.n_cells}], got {list(x.shape)}"
             )
-        batches = [self._run(x[i : i + _BATCH]) for i in range(0, len(x), _BATCH)]
+        batches = [self.run(x[i : i + _BATCH]) for i in range(0, len(x), _BATCH)]
         return np.concatenate(batches) if batches else np.zeros((0, self.n_classes), np.float32)
 
     def predict(self, x: NDArray[Any]) -> NDArray[Any]:

@@ -3,7 +3,6 @@ version."""
 
 from __future__ import annotations
 
-import platform
 from dataclasses import replace
 from datetime import datetime
 from functools import partial
@@ -13,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from adaptfault.bundle.bundle import Bundle
 from adaptfault.bundle.pointer import Pointer
 from adaptfault.evaluation.class_recall import class_name
-from adaptfault.evaluation.html_page import Picture, render, version_of
+from adaptfault.evaluation.html_page import Picture, render
 from adaptfault.robot.sensor_state import SensorState, unhandled_cells
 from diagnostics import Diagnosis
 from diagnostics.decision.grouped_faults import by_group
@@ -106,8 +105,6 @@ def write_report(
         runs=[_shown(one) for one in reversed(runs)],
         problems=problems,
         date=datetime.now().astimezone().strftime("%Y-%m-%d %H:%M %Z"),
-        versions=f"adaptfault {version_of('adaptfault')}",
-        python=platform.python_version(),
     )
 
 

@@ -92,8 +92,8 @@ def test_torch_does_without_onnx_runtime(versions, monkeypatch):
 def test_a_long_log_is_predicted_a_few_windows_at_a_time(versions, monkeypatch):
     model = Inference.load(versions["head"], runtime="onnx")
     sizes = []
-    once = model._run
-    monkeypatch.setattr(model, "_run", lambda x: sizes.append(len(x)) or once(x))
+    once = model.run
+    monkeypatch.setattr(model, "run", lambda x: sizes.append(len(x)) or once(x))
     x = small_windows(50)
     np.testing.assert_allclose(
         model.predict_proba(x)[-3:], model.predict_proba(x[-3:]), rtol=0, atol=1e-6

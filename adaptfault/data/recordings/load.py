@@ -10,6 +10,8 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
+from itertools import groupby
+from operator import itemgetter
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -112,41 +114,34 @@ class Opened:
         problems: list[Problem],
         values: TargetTable | None,
     ) -> None:
-        self._contents = contents
         self._tables = tables
         self.layout = layout
         self.inferred = inferred
-        each = [(content, i) for content in contents for i in content.kept]
-        self._surveys = [content.surveys[i] for content, i in each]
-        self.origins = tuple(content.recordings[i] for content, i in each)
-        self.names = tuple(content.name(i) for content, i in each)
-        self.lengths = tuple(survey.length for survey in self._surveys)
-        labels = [content.labels[i] if content.labels else None for content, i in each]
+        self._take([(content, i) for content in contents for i in content.kept])
+        labels = [content.labels[i] if content.labels else None for content, i in self._each]
         orders = [content.facts.class_names for content in contents]
         self.labels, self.class_names = class_indices(labels, orders, problems)
         self.value_names: tuple[str, ...] = ()
         self.targets: tuple[NDArray[np.float32], ...] | None = None
         if values is not None:
             self.value_names = values.names
-            self.targets = tuple(one.targets for one, _ in each if one.targets is not None)
+            self.targets = tuple(one.targets for one, _ in self._each if one.targets is not None)
         self.problems = tuple(problems)
         self.late_problems: tuple[Problem, ...] = ()
 
+    def _take(self, each: list[tuple[Content, int]]) -> None:
+        """Hold recordings, each by its file and its number there."""
+        self._each = each
+        self._surveys = [content.surveys[i] for content, i in each]
+        self.origins = tuple(content.recordings[i] for content, i in each)
+        self.names = tuple(content.name(i) for content, i in each)
+        self.lengths = tuple(survey.length for survey in self._surveys)
+
     def select(self, which: Iterable[int]) -> Opened:
         """Return the recordings with these numbers, in their order."""
-        chosen = set(which)
-        order = sorted(chosen)
-        numbers = iter(range(len(self)))
-        contents = []
-        for content in self._contents:
-            kept = tuple(i for i in content.kept if next(numbers) in chosen)
-            contents += [replace(content, kept=kept)] if kept else []
+        order = sorted(set(which))
         part = copy(self)
-        part._contents = contents
-        part._surveys = [self._surveys[i] for i in order]
-        part.origins = tuple(self.origins[i] for i in order)
-        part.names = tuple(self.names[i] for i in order)
-        part.lengths = tuple(self.lengths[i] for i in order)
+        part._take([self._each[i] for i in order])
         if self.labels is not None:
             part.labels = self.labels[order]
         if self.targets is not None:
@@ -217,14 +212,16 @@ class Opened:
         """Yield the blocks of each recording, calibrated."""
         clamped = np.zeros((2, self.layout.n_cells), dtype=np.int64)
         outside: list[Problem] = []
-        for content in self._contents:
+        files = 0
+        for content, each in groupby(self._each, key=itemgetter(0)):
+            files += 1
             range_ = OutOfRange(content, self.layout)
-            for i in content.kept:
+            for _, i in each:
                 yield self._blocks(content, i, clamped, range_)
             problem = range_.problem()
             if problem is not None:
                 outside.append(problem)
-        late = out_of_range(outside, len(self._contents), self.layout)
+        late = out_of_range(outside, files, self.layout)
         if clamped.any():
             late.append(clamped_readings(clamped))
         self.late_problems = tuple(late)

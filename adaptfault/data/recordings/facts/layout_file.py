@@ -134,9 +134,7 @@ def read_layout(path: str | PathLike[str]) -> SensorLayout:
         raise InputError.at(
             path, f"fields 'pads', 'rows', 'cols': more than {MOST_CELLS} cells; check the sizes"
         )
-    if "present" in document and not (
-        _are_bools(document["present"]) and _is_regular(document["present"])
-    ):
+    if "present" in document and not _is_mask(document["present"]):
         raise InputError.at(
             path, "field 'present': expected lists [pads][rows][cols] of true and false; correct it"
         )
@@ -196,15 +194,10 @@ def _is(value: Any, kind: type) -> bool:
     return isinstance(value, int | float) if kind is float else isinstance(value, kind)
 
 
-def _is_regular(lists: Any) -> bool:
+def _is_mask(lists: Any) -> bool:
+    """Return whether lists of one length hold true and false alone."""
     try:
-        np.array(lists, dtype=bool)
+        mask = np.array(lists)
     except ValueError:
         return False
-    return True
-
-
-def _are_bools(value: Any, depth: int = 0) -> bool:
-    if isinstance(value, list) and depth < 3:
-        return all(_are_bools(item, depth + 1) for item in value)
-    return isinstance(value, bool) or value in (0, 1)
+    return mask.dtype.kind in "biuf" and mask.ndim <= 3 and bool(np.isin(mask, (0, 1)).all())

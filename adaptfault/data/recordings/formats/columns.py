@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adaptfault.data.recordings.errors import InputError, Problem
+from adaptfault.data.recordings.facts.rates import TICKS
 from adaptfault.data.recordings.facts.roles import (
     EPISODES,
     LABELS,
@@ -40,7 +41,6 @@ Names = str | Iterable[str | int]
 
 _RANGE = re.compile(r"(\d+)(?:-(\d+))?", re.ASCII)
 
-_EPOCH = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}
 _YEARS = 1e9, 4.2e9  # seconds since 1970: 2001 to 2103
 
 _LEAST = 5  # lines that show that a column rises
@@ -300,7 +300,7 @@ def _clock_of(path: Path, dialect: Dialect, *, even: bool) -> str | None:
     times = np.array(numbers, dtype=np.float64)
     if np.mean(np.diff(times) > 0) < _RISES:
         return None
-    for unit, ticks in _EPOCH.items():
+    for unit, ticks in TICKS.items():
         if _YEARS[0] <= times[0] / ticks < _YEARS[1]:
             return unit
     if np.array_equal(times, np.rint(times)) and np.median(np.diff(times)) == 1:

@@ -11,6 +11,7 @@ import builtins
 import csv
 import re
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import dropwhile
@@ -84,12 +85,20 @@ class Dialect:
 
     def split(self, line: str) -> list[str]:
         """Return the values of a line, without blanks and quotes around them."""
-        cells = _split(line, self.separator)
+        cells = line.split(self.separator or None)
+        if '"' in line:
+            with suppress(csv.Error):  # a cell of more than 128 KB
+                cells = next(
+                    csv.reader([line], delimiter=self.separator or " ", skipinitialspace=True)
+                )
+            cells = [bare(cell) for cell in cells]
+        elif self.separator and (" " in line or "\t" in line):
+            cells = [cell.strip() for cell in cells]
         return cells[:-1] if self.ends and len(cells) > 1 and not cells[-1] else cells
 
     def first(self, line: str) -> str:
         """Return the first value of a line."""
-        return _first(line, self.separator)
+        return bare(line.split(self.separator or None, 1)[0])
 
     def number(self, cell: str) -> float | None:
         """Return the number in a cell, NaN where it is missing; None where it is text."""
@@ -100,7 +109,31 @@ class Dialect:
     def texts(self, line: str) -> list[int]:
         """Return the columns in which a line holds neither a number, a date nor a time of day, and
         is not without a value."""
-        return _texts(self.split(line), self.separator)
+        cells = self.split(line)
+        if _are_floats(cells):
+            return []
+        return [i for i, cell in enumerate(cells) if self._kind(cell) == "text"]
+
+    def is_numbers(self, line: str) -> bool:
+        """Return whether most values of a line are numbers."""
+        cells = self.split(line)
+        if _are_floats(cells):
+            return True
+        kinds = [self._kind(cell) for cell in cells if cell]
+        return len(kinds) > 2 * kinds.count("text")
+
+    def begins_with_numbers(self, line: str) -> bool:
+        """Return whether a line is one of numbers: its first value is one, or most of them are."""
+        if is_frame(line):
+            return False
+        return self._kind(self.first(line)) == "number" or self.is_numbers(line)
+
+    def _kind(self, cell: str) -> str:
+        """Return whether a cell is a "number", "missing" or "text"; dates are numbers."""
+        if cell.lower() in MISSING:
+            return "missing"
+        is_number = self.number(cell) is not None or is_written_out(cell)
+        return "number" if is_number else "text"
 
     def unreadable(self, line: str) -> list[int]:
         """Return the columns in which a line holds text or a date."""
@@ -108,6 +141,10 @@ class Dialect:
         if _are_floats(cells):
             return []
         return [i for i, cell in enumerate(cells) if self.number(cell) is None]
+
+
+_PLAIN = tuple(Dialect(separator=separator) for separator in _SEPARATORS)
+"""What may separate the values of a line, in the order in which it is tried."""
 
 
 def number(cell: str) -> float | None:
@@ -204,7 +241,7 @@ def find_dialect(path: Path) -> Dialect | None:
                 break
             above.append(held[1])
             held = None
-        if _separator(line) is None:
+        if _dialect_of(line) is None:
             above.append(line)
         else:
             held = at, line
@@ -221,12 +258,12 @@ def _tekscan(path: Path, skip: int, preamble: list[str]) -> Dialect | None:
             break
     if not rows:
         return None
-    separator = next(one for one in _SEPARATORS if one in rows[0])
-    return Dialect(
-        encoding_of(path),
-        separator,
+    dialect = next(one for one in _PLAIN if one.separator in rows[0])
+    return replace(
+        dialect,
+        encoding=encoding_of(path),
         skip=skip,
-        width=len(_split(rows[0], separator)),
+        width=len(dialect.split(rows[0])),
         rows=len(rows),
         marker=marker_of("Frame 1"),
         probe=tuple(rows),
@@ -241,27 +278,28 @@ def _confirms(line: str, after: str) -> bool:
     A line of several numbers alone does: where the others have another width, it is to be named,
     not passed over.
     """
-    separator = _separator(line) or ""
-    cells = _split(line, separator)
-    if len(cells) > 1 and not _texts(cells, separator):
+    dialect = _dialect_of(line) or _PLAIN[-1]
+    width = len(dialect.split(line))
+    if width > 1 and not dialect.texts(line):
         return True
-    return _separator(after) == separator and len(_split(after, separator)) == len(cells)
+    return _dialect_of(after) == dialect and len(dialect.split(after)) == width
 
 
 def _found(path: Path, above: list[str], first: int, line: str) -> Dialect:
     """Return the dialect of a file whose table begins at its line ``first``."""
-    separator = _separator(line) or ""
-    runs, markers, probe = _runs(path, first, separator)
+    dialect = _dialect_of(line) or _PLAIN[-1]
+    separator = dialect.separator
+    runs, markers, probe = _runs(path, first, dialect)
     rows, marker = _frames(runs, markers, above[-1] if above else "")
     skip = first - 1
-    if not rows and _counts_columns(_split(line, separator)):
+    if not rows and _counts_columns(dialect.split(line)):
         above = [*above, line]
         probe = probe[1:]
         skip = first
     ends = separator not in ("", ",") and all(text.endswith(separator) for text in probe)
-    dialect = Dialect(encoding_of(path), separator, ends=ends)
+    dialect = replace(dialect, encoding=encoding_of(path), ends=ends)
     width = len(dialect.split(probe[0] if probe else line))
-    header = _header(above[-1], separator, width) if above else ()
+    header = _header(above[-1], dialect, width) if above else ()
     if rows and not marker and header:  # blank lines inside a table
         rows = 0
     return replace(
@@ -276,7 +314,7 @@ def _found(path: Path, above: list[str], first: int, line: str) -> Dialect:
     )
 
 
-def _runs(path: Path, first: int, separator: str) -> tuple[list[int], list[str], list[str]]:
+def _runs(path: Path, first: int, dialect: Dialect) -> tuple[list[int], list[str], list[str]]:
     """Return the lengths of the first blocks of lines of numbers, the lines between them, and the
     first lines of numbers."""
     runs = [0]
@@ -289,7 +327,7 @@ def _runs(path: Path, first: int, separator: str) -> tuple[list[int], list[str],
         is_row = line[:1].isdigit()  # a shortcut for nearly every line
         if not is_row and is_comment(line) and not is_frame(line):
             continue
-        if not line or not (is_row or _begins_with_numbers(line, separator)):
+        if not line or not (is_row or dialect.begins_with_numbers(line)):
             between = line or between or ""
             continue
         if between is not None:
@@ -323,20 +361,11 @@ def _frames(runs: Sequence[int], markers: Sequence[str], above: str) -> tuple[in
     return (runs[0] if is_regular else 0), ""
 
 
-def _begins_with_numbers(line: str, separator: str) -> bool:
-    """Return whether a line is one of numbers: its first value is one, or most of them are."""
-    if is_frame(line):
-        return False
-    return _kind(_first(line, separator), separator) == "number" or _is_mostly_numbers(
-        _split(line, separator), separator
-    )
-
-
-def _header(line: str, separator: str, width: int) -> tuple[str, ...]:
+def _header(line: str, dialect: Dialect, width: int) -> tuple[str, ...]:
     """Return the names of so many columns, where a line holds them; empty where it does not."""
     written = line.lstrip().lstrip("#%/") if is_comment(line) else line
-    for one in (separator, *_SEPARATORS):
-        cells = _split(written, one)
+    for one in (replace(dialect, ends=False), *_PLAIN):
+        cells = one.split(written)
         while len(cells) > width and not cells[-1]:
             cells = cells[:-1]
         if len(cells) == width < 2 * sum(map(bool, cells)):
@@ -344,39 +373,13 @@ def _header(line: str, separator: str, width: int) -> tuple[str, ...]:
     return ()
 
 
-def _separator(line: str) -> str | None:
-    """Return what separates the values of a line, most of which are numbers; None where they are
+def _dialect_of(line: str) -> Dialect | None:
+    """Return how the values of a line are separated, most of which are numbers; None where they are
     not."""
     if is_comment(line) or is_frame(line):
         return None
-    for separator in _SEPARATORS:
-        if separator in line and _is_mostly_numbers(_split(line, separator), separator):
-            return separator
-    return None
-
-
-def _first(line: str, separator: str) -> str:
-    return bare(line.split(separator or None, 1)[0])
-
-
-def _split(line: str, separator: str) -> list[str]:
-    if '"' in line:
-        try:
-            cells = next(csv.reader([line], delimiter=separator or " ", skipinitialspace=True))
-        except csv.Error:  # a cell of more than 128 KB
-            cells = line.split(separator or None)
-        return [bare(cell) for cell in cells]
-    if not separator:
-        return line.split()
-    cells = line.split(separator)
-    return [cell.strip() for cell in cells] if " " in line or "\t" in line else cells
-
-
-def _is_mostly_numbers(cells: Sequence[str], separator: str) -> bool:
-    if _are_floats(cells):
-        return True
-    kinds = [_kind(cell, separator) for cell in cells if cell]
-    return len(kinds) > 2 * kinds.count("text")
+    found = (one for one in _PLAIN if one.separator in line and one.is_numbers(line))
+    return next(found, None)
 
 
 def _are_floats(cells: Sequence[str]) -> bool:
@@ -386,21 +389,6 @@ def _are_floats(cells: Sequence[str]) -> bool:
     except ValueError:
         return False
     return True
-
-
-def _texts(cells: Sequence[str], separator: str) -> list[int]:
-    """Return the indices of the cells that are text."""
-    if _are_floats(cells):
-        return []
-    return [i for i, cell in enumerate(cells) if _kind(cell, separator) == "text"]
-
-
-def _kind(cell: str, separator: str) -> str:
-    """Return whether a cell is a "number", "missing" or "text"; dates are numbers."""
-    if cell.lower() in MISSING:
-        return "missing"
-    written = cell if separator == "," else cell.replace(",", ".")
-    return "number" if number(written) is not None or is_written_out(cell) else "text"
 
 
 def _counts_columns(cells: Sequence[str]) -> bool:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from adaptfault.evaluation.html_page import Picture, render
+from adaptfault.viewers.html_page import Picture, render
 from diagnostics import FaultSet
 from diagnostics.decision.plot import draw_forces, pads_figure
 
@@ -38,7 +38,7 @@ def write_report(path: str | Path, result: DemoResult) -> Path:
     """
     return render(
         path,
-        "report.html",
+        "evaluation/report.html",
         result=result,
         layout=result.recordings.layout,
         rows=_rows(result),

@@ -221,9 +221,9 @@ class FleetReport:
         Raises:
             OSError: the file cannot be written.
         """
-        from adaptfault.evaluation.html_page import render
+        from adaptfault.viewers.html_page import render
 
-        return render(path, "fleet.html", report=self)
+        return render(path, "fleet/fleet.html", report=self)
 
 
 def _group(years: int, outcomes: list[Outcome]) -> AgeGroup:

@@ -1,1 +1,1 @@
-"""Files that people look at: MCAP for Foxglove, RRD for Rerun."""
+"""Files that people look at: HTML pages, MCAP for Foxglove, RRD for Rerun."""

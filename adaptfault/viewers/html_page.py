@@ -26,8 +26,8 @@ _NARROW = 4.5
 def render(
     path: str | Path, template: str, *, packages: Sequence[str] = ("adaptfault",), **values: Any
 ) -> Path:
-    """Render a template of the package into a file, with the versions of packages; return the
-    path.
+    """Render a template, named by its room and its file, into a file, with the versions of
+    packages; return the path.
 
     Raises:
         OSError: the folder cannot be written.
@@ -35,7 +35,7 @@ def render(
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
     environment = Environment(
-        loader=PackageLoader("adaptfault.evaluation"), autoescape=True, undefined=StrictUndefined
+        loader=PackageLoader("adaptfault", "."), autoescape=True, undefined=StrictUndefined
     )
     environment.filters["percent"] = percent
     environment.filters["legend"] = legend

@@ -25,6 +25,7 @@ from diagnostics.model.ways.comes_and_goes import COMES_AND_GOES
 from diagnostics.preprocessing.levels import CERTAIN_RATIO, DOUBTED, RARE
 
 _SHOWN = 1.0  # evidence that excludes a way to fail, or suggests one
+_ALONE = 0.5  # of what lines move, that is no offset of their pad
 _NO_READING = (FaultKind.LATE, FaultKind.COPY, FaultKind.WEAK)  # but frames, a cell, a gain
 
 Floats = NDArray[np.float64]
@@ -75,7 +76,11 @@ def _reads_the_same_loads(alias: Fault, log: Log) -> bool:
     cells = list(alias.cells)
     since = log.record.begins >= (alias.onset or 0)
     loaded = (log.load[:, cells] > NOTHING) & ~log.disturbed[cells]
-    return len(cells) > 2 and bool(loaded[since].any())
+    if len(cells) == 2 or not loaded[since].any():
+        return False
+    moves = np.median(np.ptp(log.record.mean[since][:, cells], axis=0))
+    alone = np.median(np.ptp(log.above[since][:, cells], axis=0))
+    return bool(alone > _ALONE * moves)
 
 
 def findings(

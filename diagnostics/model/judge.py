@@ -36,7 +36,7 @@ from diagnostics.model.ways import COMES_AND_GOES, FLOATS, WAYS, Way
 _SUSPECT = 3.0  # evidence of a fault with which a cell predicts no other
 _WORST = 0.5  # of the highest evidence: who leaves in one round
 _ROUNDS = 16
-_GOES = 8.0  # evidence that a fault has gone
+_GOES = 6.0  # evidence that a fault has gone
 HELD = 3  # pieces at the end at one load: it may be stuck
 _PREVALENCE = 0.03
 _WEIGHS = 20.0  # cells that the usual prevalence is worth

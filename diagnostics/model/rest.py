@@ -110,6 +110,11 @@ class Rest:
     step: float = 0.0
     at_top: float = 0.0
 
+    @property
+    def least(self) -> float:
+        """Readings that differ by less are the same."""
+        return max(NARROW * self.full, 2 * self.step)
+
     def shared(self, record: Record, telling: Mask) -> Shared:
         """Return what the pads of a log share; ``telling``: bool ``[D]``, cells that are received
         and live."""
@@ -141,16 +146,18 @@ class Rest:
                 continue
             of_pad = np.sort(np.where(at_end[:, tell], np.nan, above[:, tell]), axis=1)
             noise = float(np.median(self.near[tell]))
-            middle, weight = _even(of_pad, noise)
+            finest = max(self.least, min(noise, float(np.median(self.noise[tell]))))
+            middle, weight, surely = _even(of_pad, noise, finest)
             around = _around(middle, weight >= 1, record)
             # no load is negative: in a contact with most of a pad that sags, the lowest tell
             lowest = of_pad[:, : len(tell) // 2 + 1]
             if lowest.shape[1] > _FEWEST:
-                of_lowest, even = _even(lowest, noise / 2)
+                of_lowest, even, _ = _even(lowest, noise / 2, noise / 2)
                 around = np.where((of_lowest < 0) & (even > 0), even * of_lowest, around)
             shared = weight * middle + (1 - weight) * around
             if self.pressed[cells].any():
-                shared = np.minimum(shared, _throughout(middle, weight >= 1, record))
+                throughout = _throughout(middle, weight >= 1, record)
+                shared = np.minimum(shared, np.maximum(throughout, surely * middle))
             found[:, cells] = shared[:, None]
         return found
 
@@ -299,9 +306,10 @@ def fit_rest(record: Record, full: float, step: float, pad: Cells, living: Mask)
     most = np.full_like(usual, np.inf)
     high = np.fmax.reduce(record.high)
     rest = Rest(none, none, full, high, pad, usual, none, most, most, every, every, step)
-    least = max(NARROW * full, 2 * step)
+    least = rest.least
     level, _ = _lowest(record.mean, first, least)
-    rest = replace(rest, level=level, near=least * usual)
+    noise = rest.noise_of(record, record.mean, living)
+    rest = replace(rest, level=level, near=least * usual, noise=noise)
     for _ in range(_ROUNDS):
         of_pads = rest.of_pads(record, living)
         share = _share(record.mean - rest.level, of_pads, rest.near, usual, least)
@@ -310,9 +318,9 @@ def fit_rest(record: Record, full: float, step: float, pad: Cells, living: Mask)
         level, spread = _lowest(without, first, least)
         range_ = record.high - record.low
         resting = np.where(without <= level + 2 * spread, range_, np.nan)
-        noise = np.nan_to_num(known_quantile(resting, 0.5, axis=0)).astype(np.float32)
+        moves = np.nan_to_num(known_quantile(resting, 0.5, axis=0)).astype(np.float32)
         unsteady = np.minimum(spread, _UNSTEADY * full)
-        near = np.fmax(least, 2 * np.fmax(noise, unsteady)).astype(np.float32)
+        near = np.fmax(least, 2 * np.fmax(moves, unsteady)).astype(np.float32)
         rest = replace(rest, level=level, near=near, share=share)
     lowest = np.fmin.reduceat(without, first, axis=0)
     settles = (lowest <= level + near).mean(axis=0) >= _SETTLES
@@ -324,8 +332,7 @@ def fit_rest(record: Record, full: float, step: float, pad: Cells, living: Mask)
     above = rest.above(record, shared.offset)
     noise = np.maximum(rest.noise_of(record, above, living), _change(shared.drift, record))
     at_top = rest.share_at_top(record, above, living)
-    least = np.maximum(near, DITHER * full)
-    offsets = np.maximum(least, _usually(rest.of_pads(record, living)))
+    offsets = np.maximum(np.maximum(near, DITHER * full), _usually(rest.of_pads(record, living)))
     drifts = _usually(replace(rest, drifts=none).drift(record, living))
     return replace(rest, noise=noise, offsets=offsets, drifts=drifts, at_top=at_top)
 
@@ -377,15 +384,22 @@ def _lowest(readings: Array, first: Cells, least: float) -> tuple[Array, Array]:
     return level, np.select([some, few], [_WIDER * width, of_few], spread).astype(np.float32)
 
 
-def _even(above: Array, noise: float) -> tuple[Array, Array]:
-    """Return middle and weight ``[n]`` of what half of the cells of a pad, at least, read alike;
+def _even(above: Array, noise: float, finest: float) -> tuple[Array, Array, Array]:
+    """Return the middle of what half of the cells of a pad, at least, read alike, how surely they
+    share it, and how surely no contact is as even: within the ``finest`` noise, ``[n]`` each;
     ``above``: ``[n, k]`` in ascending order."""
     middle, width = shortest(above, 0.5)
     below = np.maximum(noise, _EVEN * -middle)
     most = np.clip(_HALF * middle, noise, _NOISES * noise)
-    limit = np.where(middle < 0, below, most)
-    # twice as wide, nothing is shared; between, a part: a jump would look like a load
-    return np.nan_to_num(middle), np.nan_to_num(np.clip(2 - width / limit, 0, 1))
+    middle = np.nan_to_num(middle)
+    return middle, _narrow(width, np.where(middle < 0, below, most)), _narrow(width, finest)
+
+
+def _narrow(width: Array, limit: Array | float) -> Array:
+    """Return 1 up to the ``limit``, and 0 from twice of it on; between, a part: a jump would look
+    like a load."""
+    found: Array = np.nan_to_num(np.clip(2 - width / limit, 0, 1))
+    return found
 
 
 def _around(shared: Array, sure: Mask, record: Record) -> Array:

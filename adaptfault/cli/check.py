@@ -182,7 +182,8 @@ class Check(Inspecting):
         ]
         found = replace(found, inspection=replace(found.inspection, findings=tuple(findings)))
         source = ", ".join(self.recordings)
-        checked = quick_check(statistics, found, log, grouped=bool(groupings), source=source)
+        clock = None if log is None else log.clock
+        checked = quick_check(statistics, found, clock, grouped=bool(groupings), source=source)
         code = checked.severity if fails is None else checked.findings.failed(fails)
         notes = []
         if self.sample is not None and log is not None:

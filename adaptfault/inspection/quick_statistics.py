@@ -2,9 +2,9 @@
 them one behind the other.
 
 Of each recording: the range of each cell, sums that tell whether it moves with those beside it
-(:mod:`diagnostics.when.together`), five frames that tell the direction of load and the step of the
-converter; and of all how often frames repeat. The size depends on the number of recordings, not on
-that of frames.
+(:mod:`diagnostics.when.together`), how it begins (:mod:`adaptfault.inspection.begins`), five frames
+that tell the direction of load and the step of the converter; and of all how often frames repeat.
+The size depends on the number of recordings, not on that of frames.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from __future__ import annotations
 import io
 import json
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from itertools import chain
 from os import PathLike
 from pathlib import Path
@@ -26,6 +26,7 @@ from adaptfault.data.atomic import atomic_write
 from adaptfault.data.recordings import Opened, Recordings
 from adaptfault.data.recordings.errors import InputError
 from adaptfault.data.summary import Summary
+from adaptfault.inspection.begins import Begins, Begun
 from adaptfault.inspection.naming import Naming, classes_of
 from diagnostics import SensorLayout
 from diagnostics.preprocessing.readings import RecordingBlocks
@@ -33,7 +34,7 @@ from diagnostics.sensor.repeated_frames import Repetitions
 from diagnostics.when import Spans
 from diagnostics.when.together import Together
 
-SCHEMA = "adaptfault.quick/1"
+SCHEMA = "adaptfault.quick/2"
 
 _KEPT = 5  # frames of each recording, evenly spread
 
@@ -48,6 +49,7 @@ class Statistics:
         classes: of each recording; None: unknown.
         spans: ranges of the readings.
         together: sums.
+        begins: how they begin.
         sample: float32 ``[n, 5, D]``, frames of each.
         missing: int ``[D]``, readings.
         repetitions: of frames.
@@ -59,6 +61,7 @@ class Statistics:
     classes: tuple[str, ...] | None
     spans: Spans
     together: Together
+    begins: Begins
     sample: NDArray[np.float32]
     missing: NDArray[np.int64]
     repetitions: Repetitions
@@ -74,6 +77,7 @@ class Statistics:
         together = []
         pieces = []
         repetitions = []
+        begun: list[Begun] = []
         sample = np.full((len(naming.lengths), _KEPT, layout.n_cells), np.nan, np.float32)
         missing = np.zeros(layout.n_cells, np.int64)
         for number, first, frames in _pieces(log, naming.lengths):
@@ -82,6 +86,9 @@ class Statistics:
             together.append(Together.of(valid.given, layout))
             pieces.append(len(frames))
             repetitions.append(Repetitions.of(frames[:, present]))
+            if not first:
+                begun.append(Begun(layout))
+            begun[-1].add(frames)
             missing += np.isnan(valid.given[0]).sum(axis=0)
             kept = np.linspace(0, naming.lengths[number] - 1, _KEPT).astype(int) - first
             here = (kept >= 0) & (kept < len(frames))
@@ -93,6 +100,7 @@ class Statistics:
             None if classes is None else tuple(classes),
             Spans.joined(spans).whole(pieces, naming.lengths),
             Together.joined(together).whole(pieces, naming.lengths),
+            Begins.joined([one.begins() for one in begun]),
             sample,
             missing,
             Repetitions.joined(repetitions),
@@ -124,6 +132,7 @@ class Statistics:
             classes,
             Spans.joined([part.spans for part in parts]),
             Together.joined([part.together for part in parts]),
+            Begins.joined([part.begins for part in parts]),
             np.concatenate([part.sample for part in parts]),
             np.sum([part.missing for part in parts], axis=0),
             Repetitions.joined([part.repetitions for part in parts]),
@@ -179,6 +188,7 @@ class Statistics:
             sample=self.sample,
             missing=self.missing,
             between=self.repetitions.between,
+            **{f"begins_{name}": values for name, values in vars(self.begins).items()},
         )
         atomic_write(path, stored.getvalue())
 
@@ -204,6 +214,7 @@ class Statistics:
                     None if classes is None else tuple(classes),
                     Spans(held["low"], held["high"]),
                     Together(held["sums"]),
+                    Begins(*(held[f"begins_{field.name}"] for field in fields(Begins))),
                     held["sample"],
                     held["missing"],
                     counted,

@@ -3,6 +3,8 @@ line."""
 
 from __future__ import annotations
 
+import atexit
+import gc
 import logging
 import sys
 import traceback
@@ -18,6 +20,10 @@ from adaptfault.data.plugins import plugins, what_to_install
 from adaptfault.data.shortage import is_shortage
 
 __path__ = extend_path(__path__, __name__)  # the packages of the repository add commands
+
+# Python looks through all that is left for garbage when it ends, a sixth of the time of a short
+# command
+atexit.register(gc.freeze)
 
 GROUP = "adaptfault.commands"
 

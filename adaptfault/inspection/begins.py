@@ -128,7 +128,10 @@ class Begun:
             self._start = _mean(self._first)
         self._lowest = np.fmin(self._lowest, np.fmin.reduce(frames))
         present = frames[:, self._present]
-        filled = np.nan_to_num(np.where(np.isnan(present), self._start[self._present], present))
+        missing = np.isnan(present)
+        filled = present
+        if missing.any():
+            filled = np.where(missing, np.nan_to_num(self._start[self._present]), present)
         means = filled.mean(axis=1, dtype=np.float64)
         self._means.append(means)
         for end, at in enumerate((int(means.argmin()), int(means.argmax()))):

@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adaptfault.data.recordings.errors import InputError, Problem
-from adaptfault.data.recordings.facts.episodes import Division, Episode, numbered
+from adaptfault.data.recordings.facts.episodes import Division, Episode
 from adaptfault.data.recordings.facts.labels import natural_key
 from adaptfault.data.recordings.facts.roles import (
     COUNTERS,
@@ -382,7 +382,9 @@ class Chooser:
             stored = np.array(texts(stored))
         if stored.dtype.kind == "f" and not np.isfinite(stored).all():
             raise InputError.at(self.path, f"rows without {name}; leave them out")
-        return numbered([plain_number(value) for value in stored]) if len(stored) else []
+        changes = np.flatnonzero(stored[1:] != stored[:-1]) + 1
+        ends = [0, *changes.tolist(), len(stored)] if len(stored) else []
+        return [Episode(first, last, plain_number(stored[first])) for first, last in pairwise(ends)]
 
     def _near(self, name: str, wanted: Sequence[str], length: int | None = None) -> str | None:
         """Return an array in the group of ``name``, or above it: the first of the names that are

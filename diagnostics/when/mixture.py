@@ -12,7 +12,7 @@ from enum import IntEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from diagnostics.preprocessing.levels import EXPECTED, FEWEST, LEAST_LOADED, MAJORITY
+from diagnostics.preprocessing.levels import EXPECTED, FEWEST, LEAST_LOADED, LOW, MAJORITY
 from diagnostics.when.chain import Course, Lasting, Loose
 from diagnostics.when.log_gamma import log_gamma
 
@@ -195,18 +195,22 @@ class Mixture:
         """Return the share of the recordings that count as independent of each other.
 
         It is the variance of the sum of single recordings over that of successive ones, in the
-        order in which they are most alike.
+        order in which they are most alike. The units that deviate most together do not count: what
+        is dead in some recordings does, and would hide itself.
         """
         rate = counts + _probabilities(pooled)
         rate /= rate.sum(axis=2, keepdims=True)
         holds = 1 - rate[self._unit, context, Symbol.MOVED]
         deviation = np.where(counted, (self._symbol != Symbol.MOVED) - holds, 0.0)
-        alone = float((deviation**2).sum())
+        alone = (deviation**2).sum(axis=0)
+        begins = np.arange(0, len(deviation), FEWEST)
+        used = max(1, round((1 - 2 * LOW) * len(alone)))
         share = 1.0
         for order, _ in self._courses:
-            begins = np.arange(0, len(deviation), FEWEST)
-            together = float((np.add.reduceat(deviation[order], begins, axis=0) ** 2).sum())
-            share = min(share, alone / max(together, np.finfo(float).tiny))
+            together = (np.add.reduceat(deviation[order], begins, axis=0) ** 2).sum(axis=0)
+            usual = np.argsort(together - alone, kind="stable")[:used]
+            least = max(float(together[usual].sum()), np.finfo(float).tiny)
+            share = min(share, float(alone[usual].sum()) / least)
         return share
 
 

@@ -124,6 +124,23 @@ def test_cells_that_hold_a_value_through_one_task_are_found_where_loads_last(see
     assert not np.delete(suspect, cells, axis=1).any()
 
 
+@pytest.mark.parametrize("seed", [0, 3, 4])
+def test_a_row_that_is_dead_in_the_middle_of_few_recordings_does_not_hide_itself(seed):
+    layout = SensorLayout(1, 12, 10, full_scale=3.3, rate=20.0)
+    row = list(range(60, 70))
+    made = simulate(12, layout, n_frames=60, seed=seed, classes=("nothing", "normal"))
+    order = np.argsort(np.arange(len(made.frames)) % 12, kind="stable")  # in turn
+    log = [np.asarray(made.frames[i], np.float64) for i in order]
+
+    def suspects(log: list[np.ndarray]) -> list[int]:
+        spans = Spans.of(RecordingBlocks(log))
+        held = find_held(spans, layout, 0.0165, made.labels[order])
+        return np.flatnonzero(held.suspect.any(axis=0)).tolist()
+
+    assert suspects(log) == []
+    assert suspects(broken(log, row, set(range(8, 16)))) == row
+
+
 def test_few_recordings_say_nothing(grasps):
     assert not found(broken(grasps[:10], ROW, set(range(5)))).any()
 

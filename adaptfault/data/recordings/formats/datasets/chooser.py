@@ -238,7 +238,14 @@ class Chooser:
         if part.clock is not None:
             units = self.contents.attributes.get(part.clock, {}).get("units")
             tick = unit_of(part.clock, units)
-        return Readings(part, tuple(packings), self.is_turned, tick)
+        masks = tuple(name for name in part.names if self._has_mask(name))
+        return Readings(part, tuple(packings), masks, self.is_turned, tick)
+
+    def _has_mask(self, name: str) -> bool:
+        """Return whether the file says which readings of an array are valid; a mask of another
+        shape is none."""
+        mask = self.contents.valid.get(name)
+        return mask is not None and tuple(mask.shape) == tuple(self.contents.arrays[name].shape)
 
     def _packing(self, name: str) -> Packing:
         try:

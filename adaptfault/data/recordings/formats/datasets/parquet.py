@@ -146,7 +146,7 @@ class _Column:
             high = min(last - begin, rows)
             if low < high:
                 table = _group(self.path, group, self.beside)
-                column = table.column(self.name).combine_chunks().slice(low, high - low)
+                column = table.column(self.name).slice(low, high - low).combine_chunks()
                 pieces.append(_array(self.path, column, self, begin + low))
             begin += rows
         return np.concatenate(pieces[1:] or pieces)
@@ -186,8 +186,8 @@ def _tensor(kind: Any) -> list[int]:
 
 
 def _dtype(path: Path, kind: Any) -> np.dtype[Any] | None:
-    """Return numpy's type for the values of a column; None where they are no numbers, times or
-    texts."""
+    """Return numpy's type for the values of a column; None where they are no numbers, truth values,
+    times or texts."""
     types = imported("pyarrow.types", path)
     if types.is_integer(kind) or types.is_floating(kind):
         number: np.dtype[Any] = np.dtype(_NUMBERS.get(str(kind), str(kind)))
@@ -198,6 +198,8 @@ def _dtype(path: Path, kind: Any) -> np.dtype[Any] | None:
         return np.dtype("datetime64[ns]")
     if types.is_duration(kind):
         return np.dtype("timedelta64[ns]")
+    if types.is_boolean(kind):
+        return np.dtype(np.bool_)
     is_text = types.is_string(kind) or types.is_large_string(kind) or types.is_string_view(kind)
     return np.dtype(object) if is_text else None
 

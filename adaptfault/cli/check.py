@@ -20,8 +20,6 @@ from adaptfault.cli.shared_options import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from adaptfault.data.recordings import Opened, Recordings
     from adaptfault.inspection.data_set import DataSetCheck
     from adaptfault.inspection.findings import FailOn
@@ -103,7 +101,12 @@ class Check(Inspecting):
     def _full(self, fails: FailOn | None) -> int:
         """Check a data set with a model of its cells."""
         from adaptfault.inspection.check_log import check_log
-        from adaptfault.inspection.groupings import coincide, data_sets_of, read_groupings
+        from adaptfault.inspection.groupings import (
+            coincide,
+            dividing,
+            groupings_of,
+            read_groupings,
+        )
         from adaptfault.inspection.naming import Naming
 
         if self.write_valid:
@@ -121,7 +124,7 @@ class Check(Inspecting):
         inspected = inspect_log(self, part)
         log = inspected.log
         report_range(log)
-        groupings = dict(data_sets_of(log, self.recordings))
+        groupings = dict(dividing(groupings_of(log, self.recordings)))
         if self.groups is not None:
             groupings |= read_groupings(self.groups, log.names)
         found = inspected.inspection
@@ -147,14 +150,18 @@ class Check(Inspecting):
 
     def _quick(self, fails: FailOn | None) -> int:
         """Check a data set in one pass, a part of it, or merged parts."""
-        from adaptfault.inspection.groupings import coincide, data_sets_of, read_groupings
+        from adaptfault.inspection.groupings import (
+            coincide,
+            dividing,
+            groupings_of,
+            read_groupings,
+        )
         from adaptfault.inspection.quick import quick, quick_check
         from adaptfault.inspection.quick_statistics import Statistics
 
         self._refuse_beside_quick()
         log: Opened | None = None
         n_recordings = 0
-        groupings: dict[str, Sequence[str]] = {}
         if self.merge:
             statistics = Statistics.joined([Statistics.load(path) for path in self.recordings])
         else:
@@ -162,14 +169,15 @@ class Check(Inspecting):
             self.say_inferred(whole.inferred)
             log = self._part_of(whole)
             n_recordings = len(whole)
-            statistics = Statistics.of(log, self.left_out)
+            divided = groupings_of(log, self.recordings)
+            statistics = Statistics.of(log, self.left_out, divided)
             report_range(log)
-            groupings |= data_sets_of(log, self.recordings)
         if self.shard:
             assert self.out is not None
             statistics.save(self.out)
             self.say(f"{len(statistics.naming.lengths)} recordings in {self.out}")
             return 0
+        groupings = dict(dividing(statistics.groupings))
         if self.groups is not None:
             groupings |= read_groupings(self.groups, statistics.naming.recordings)
         found = quick(statistics)

@@ -27,6 +27,7 @@ from adaptfault.data.recordings import Opened, Recordings
 from adaptfault.data.recordings.errors import InputError
 from adaptfault.data.summary import Summary
 from adaptfault.inspection.begins import Begins, Begun
+from adaptfault.inspection.groupings import Groupings, joined
 from adaptfault.inspection.naming import Naming, classes_of
 from diagnostics import SensorLayout
 from diagnostics.preprocessing.readings import RecordingBlocks
@@ -53,6 +54,7 @@ class Statistics:
         sample: float32 ``[n, 5, D]``, frames of each.
         missing: int ``[D]``, readings.
         repetitions: of frames.
+        groupings: what else divides the recordings.
         left_out: recordings and files that could not be read.
     """
 
@@ -65,10 +67,13 @@ class Statistics:
     sample: NDArray[np.float32]
     missing: NDArray[np.int64]
     repetitions: Repetitions
+    groupings: Groupings
     left_out: int = 0
 
     @classmethod
-    def of(cls, log: Opened | Recordings, left_out: int = 0) -> Statistics:
+    def of(
+        cls, log: Opened | Recordings, left_out: int = 0, groupings: Groupings | None = None
+    ) -> Statistics:
         """Return the statistics of a data set, read once."""
         layout = log.layout
         naming = Naming.of(log)
@@ -104,6 +109,7 @@ class Statistics:
             sample,
             missing,
             Repetitions.joined(repetitions),
+            groupings or {},
             left_out,
         )
 
@@ -136,6 +142,7 @@ class Statistics:
             np.concatenate([part.sample for part in parts]),
             np.sum([part.missing for part in parts], axis=0),
             Repetitions.joined([part.repetitions for part in parts]),
+            joined([(part.groupings, len(part.naming.lengths)) for part in parts]),
             sum(part.left_out for part in parts),
         )
 
@@ -176,6 +183,7 @@ class Statistics:
             "classes": self.classes,
             "frames": self.repetitions.frames,
             "repeated": self.repetitions.repeated,
+            "groupings": {name: list(one) for name, one in self.groupings.items()},
             "left_out": self.left_out,
         }
         stored = io.BytesIO()
@@ -218,6 +226,7 @@ class Statistics:
                     held["sample"],
                     held["missing"],
                     counted,
+                    about["groupings"],
                     about["left_out"],
                 )
         except (OSError, ValueError, KeyError, TypeError, BadZipFile) as error:

@@ -195,22 +195,26 @@ class Mixture:
         """Return the share of the recordings that count as independent of each other.
 
         It is the variance of the sum of single recordings over that of successive ones, in the
-        order in which they are most alike. The units that deviate most together do not count: what
-        is dead in some recordings does, and would hide itself.
+        order in which they are most alike, both about the mean of each unit. The units that deviate
+        most together do not count: what is dead in some recordings does, and would hide itself.
         """
         rate = counts + _probabilities(pooled)
         rate /= rate.sum(axis=2, keepdims=True)
         holds = 1 - rate[self._unit, context, Symbol.MOVED]
         deviation = np.where(counted, (self._symbol != Symbol.MOVED) - holds, 0.0)
+        usual = deviation.sum(axis=0) / np.maximum(counted.sum(axis=0), 1)
+        deviation = np.where(counted, deviation - usual, 0.0)
         alone = (deviation**2).sum(axis=0)
         begins = np.arange(0, len(deviation), FEWEST)
         used = max(1, round((1 - 2 * LOW) * len(alone)))
         share = 1.0
         for order, _ in self._courses:
             together = (np.add.reduceat(deviation[order], begins, axis=0) ** 2).sum(axis=0)
-            usual = np.argsort(together - alone, kind="stable")[:used]
-            least = max(float(together[usual].sum()), np.finfo(float).tiny)
-            share = min(share, float(alone[usual].sum()) / least)
+            counts_on = np.argsort(together - alone, kind="stable")[:used]
+            of_single = float(alone[counts_on].sum())
+            of_several = float(together[counts_on].sum())
+            if of_several > of_single:
+                share = min(share, of_single / of_several)
         return share
 
 

@@ -141,6 +141,17 @@ def test_a_row_that_is_dead_in_the_middle_of_few_recordings_does_not_hide_itself
     assert suspects(broken(log, row, set(range(8, 16)))) == row
 
 
+def test_a_cell_that_dies_among_cells_that_always_move_is_found():
+    layout = SensorLayout(1, 3, 4, full_scale=1.0)
+    rng = np.random.default_rng(0)
+    course = np.sin(np.linspace(0, np.pi, 60))[:, None]
+    log = [0.1 + course * rng.uniform(0.2, 0.8, 12) for _ in range(40)]
+    for one in log[20:]:
+        one[:, 7] = 0.1
+    suspect = find_held(Spans.of(RecordingBlocks(log)), layout, 0.005).suspect
+    assert np.argwhere(suspect).tolist() == [[i, 7] for i in range(20, 40)]
+
+
 def test_few_recordings_say_nothing(grasps):
     assert not found(broken(grasps[:10], ROW, set(range(5)))).any()
 

@@ -20,6 +20,8 @@ from adaptfault.cli.shared_options import (
 )
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from adaptfault.data.recordings import Opened, Recordings
     from adaptfault.inspection.data_set import DataSetCheck
     from adaptfault.inspection.findings import FailOn
@@ -165,12 +167,12 @@ class Check(Inspecting):
         if self.merge:
             statistics = Statistics.joined([Statistics.load(path) for path in self.recordings])
         else:
-            whole = self.open(self.recordings)
-            self.say_inferred(whole.inferred)
-            log = self._part_of(whole)
-            n_recordings = len(whole)
+            is_part = bool(self.shard) or self.sample is not None
+            log = self.open(self.recordings, select=self._selected if is_part else None)
+            self.say_inferred(log.inferred)
+            n_recordings = log.n_found
             divided = groupings_of(log, self.recordings)
-            statistics = Statistics.of(log, self.left_out, divided)
+            statistics = Statistics.of(log, divided)
             report_range(log)
         if self.shard:
             assert self.out is not None
@@ -202,19 +204,18 @@ class Check(Inspecting):
         self._tell(checked, notes)
         return code
 
-    def _part_of(self, log: Opened) -> Opened:
-        """Return the recordings of a shard, or of a sample."""
+    def _selected(self, n: int) -> Sequence[int]:
+        """Return the numbers of the recordings of a shard, or of a sample, of ``n``."""
         if self.shard:
             number, of = _shard(self.shard)
-            ends = [len(log) * i // of for i in (number - 1, number)]
-            if ends[0] == ends[1]:
-                raise ValueError(f"--shard {self.shard}: the data set has {len(log)} recordings")
-            return log.select(range(*ends))
-        if self.sample is not None and self.sample < len(log):
-            import random
+            part = range(n * (number - 1) // of, n * number // of)
+            if not part:
+                raise ValueError(f"--shard {self.shard}: the data set has {n} recordings")
+            return part
+        assert self.sample is not None
+        import random
 
-            return log.select(random.Random(0).sample(range(len(log)), self.sample))
-        return log
+        return random.Random(0).sample(range(n), min(n, self.sample))
 
     def _refuse_beside_quick(self) -> None:
         """Raise ValueError where options cannot be meant together."""

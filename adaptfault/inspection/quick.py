@@ -163,7 +163,7 @@ def quick_check(
         naming.of_inspection(found.inspection),
         statistics.summary,
         clock,
-        statistics.left_out,
+        len(statistics.unread),
         begun,
         tared,
         frozenset(given),

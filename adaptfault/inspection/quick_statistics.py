@@ -55,7 +55,7 @@ class Statistics:
         missing: int ``[D]``, readings.
         repetitions: of frames.
         groupings: what else divides the recordings.
-        left_out: recordings and files that could not be read.
+        unread: why recordings and files could not be read.
     """
 
     layout: SensorLayout
@@ -68,12 +68,10 @@ class Statistics:
     missing: NDArray[np.int64]
     repetitions: Repetitions
     groupings: Groupings
-    left_out: int = 0
+    unread: tuple[str, ...] = ()
 
     @classmethod
-    def of(
-        cls, log: Opened | Recordings, left_out: int = 0, groupings: Groupings | None = None
-    ) -> Statistics:
+    def of(cls, log: Opened | Recordings, groupings: Groupings | None = None) -> Statistics:
         """Return the statistics of a data set, read once."""
         layout = log.layout
         naming = Naming.of(log)
@@ -110,7 +108,7 @@ class Statistics:
             missing,
             Repetitions.joined(repetitions),
             groupings or {},
-            left_out,
+            tuple(one.message for one in getattr(log, "problems", ()) if one.level == "error"),
         )
 
     @classmethod
@@ -143,7 +141,7 @@ class Statistics:
             np.sum([part.missing for part in parts], axis=0),
             Repetitions.joined([part.repetitions for part in parts]),
             joined([(part.groupings, len(part.naming.lengths)) for part in parts]),
-            sum(part.left_out for part in parts),
+            tuple(dict.fromkeys(one for part in parts for one in part.unread)),
         )
 
     @property
@@ -184,7 +182,7 @@ class Statistics:
             "frames": self.repetitions.frames,
             "repeated": self.repetitions.repeated,
             "groupings": {name: list(one) for name, one in self.groupings.items()},
-            "left_out": self.left_out,
+            "unread": self.unread,
         }
         stored = io.BytesIO()
         np.savez_compressed(
@@ -227,7 +225,7 @@ class Statistics:
                     held["missing"],
                     counted,
                     about["groupings"],
-                    about["left_out"],
+                    tuple(about["unread"]),
                 )
         except (OSError, ValueError, KeyError, TypeError, BadZipFile) as error:
             what = "is no part of a check, or is damaged; write it again with check --shard"

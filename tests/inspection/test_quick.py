@@ -203,6 +203,33 @@ def test_parts_that_are_written_and_merged_say_what_the_whole_says(stored, tmp_p
     assert any("parts that are merged do not hold them" in what for what in left)
 
 
+def test_a_shard_reads_its_own_recordings_and_all_together_tell_what_the_whole_tells(
+    grasps, tmp_path, capsys
+):
+    for i, one in enumerate(grasps[:16]):
+        folder = tmp_path / "set" / ("pick" if i < 8 else "place")
+        folder.mkdir(parents=True, exist_ok=True)
+        np.savetxt(folder / f"{i:02d}.csv", one, delimiter=",", fmt="%.4f")
+    (tmp_path / "set/pick/broken.csv").write_text("1,2\nx\n")  # cannot be read
+    (tmp_path / "set/place/broken.npz").write_bytes(b"PK")  # nor listed
+    given = [str(tmp_path / "set"), "--shape", "6x6", "--full-scale", "3.3", "--rate", "20"]
+    main(["check", *given, "--quick", "--json"])
+    captured = capsys.readouterr()
+    whole = json.loads(captured.out)
+    assert whole["left_out"] == 2
+    parts = [str(tmp_path / f"{i}.part") for i in (1, 2, 3)]
+    told = []
+    for i, part in enumerate(parts, 1):
+        main(["check", *given, "--shard", f"{i}/3", "--out", part])
+        told.append("broken.csv" in capsys.readouterr().err)
+    assert sum(told) == 1  # the others never look at it
+    main(["check", "--merge", *parts, "--json"])
+    merged = json.loads(capsys.readouterr().out)
+    assert whole["summary"]["classes"] == {"pick": 8, "place": 8}
+    for name in ("findings", "summary", "left_out", "begin_in_contact"):
+        assert merged[name] == whole[name]
+
+
 def test_what_is_no_part_or_of_another_array_is_refused(stored, tmp_path, capsys):
     part = str(tmp_path / "part.npz")
     assert main(["check", str(stored), "--shard", "1/2", "--out", part]) == 0

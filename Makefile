@@ -14,7 +14,7 @@ INSTALL = $(BIN)/python -m pip install --quiet --no-compile --disable-pip-versio
 CONSTRAINTS := -c constraints.txt
 PACKAGES := $(wildcard packages/*)
 
-.PHONY: demo test test-all test-cpus check quick-tests all-tests examples benchmark docs wheel-check test-pythons install-dev format clean
+.PHONY: demo test test-all test-cpus check quick-tests all-tests examples benchmark docs wheel-check lerobot-check test-pythons install-dev format clean
 
 demo: .venv/installed
 	$(BIN)/adaptfault demo
@@ -67,6 +67,12 @@ wheel-check: .venv/installed-dev
 	$(BIN)/python -m build --outdir dist .
 	for package in $(PACKAGES); do $(BIN)/python -m build --wheel --outdir dist $$package || exit 1; done
 	$(BIN)/python tests/check_wheel.py dist
+
+# LeRobot brings gigabytes, and another torch: an environment of its own.
+lerobot-check:
+	test -e build/lerobot/bin/python || $(PYTHON) -m venv build/lerobot
+	build/lerobot/bin/python -m pip install --quiet --disable-pip-version-check '.[datasets]' lerobot==0.4.4
+	build/lerobot/bin/python tests/check_lerobot.py
 
 # With the newest of all packages, on each other Python that is found and runs. On Linux torch brings 6 GB for each.
 test-pythons:

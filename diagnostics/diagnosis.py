@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from diagnostics.decision.address_aliasing import find_aliasing
-from diagnostics.decision.by_recording import with_recordings
+from diagnostics.decision.by_recording import HOLDS, with_recordings
 from diagnostics.decision.certificate import Certificate, certify
 from diagnostics.decision.judged import Judged
 from diagnostics.decision.result import Diagnosis
@@ -53,6 +53,7 @@ from diagnostics.when import (
     Spans,
     filled,
     find_held,
+    known_classes,
     own_reference,
     reads_enough,
 )
@@ -104,6 +105,7 @@ class SelfDiagnosis:
     _held_out: tuple[Sequence[NDArray[Any]], NDArray[np.float64]] | None = None
     reference_findings_: tuple[ReferenceFinding, ...] = ()
     _of_log = False  # the reference is a part of the log, which nobody stated to be healthy
+    _classes: frozenset[Any] | None = None  # that this part knows; None: unknown, or all
 
     def __init__(
         self,
@@ -362,11 +364,14 @@ class SelfDiagnosis:
         if self.reference_ is not None or len(log) < OWN_REFERENCE:
             return self
         held = self._held(self.spans(log), tolerance_of(log, self.layout), classes)
-        first = RecordingBlocks([log.given[i] for i in own_reference(log, held, classes)])
+        chosen = own_reference(log, held, classes)
+        first = RecordingBlocks([log.given[i] for i in chosen])
         if not _shows_contacts(first, log, self.layout):
             return self
         own = SelfDiagnosis(**self.get_params())
         own._of_log = True
+        if classes is not None:
+            own._classes = known_classes(chosen, classes)
         with one_thread():
             cold = self._diagnosed(log)
             return own._fit(first, progress, np.where(cold.fault_set.mask, cold.probability, 0.0))
@@ -671,13 +676,30 @@ class SelfDiagnosis:
 
         def of_part(some: tuple[int, ...]) -> Diagnosis:
             part = RecordingBlocks([log.given[i] for i in some])
-            return self._diagnosed(part, crosstalk=crosstalk)
+            found = self._diagnosed(part, crosstalk=crosstalk)
+            if self._knows(some, classes):
+                return found
+            # how healthy cells move there is not known: told is what holds a value
+            suspect = np.asarray(held.suspect[list(some)].any(axis=0))
+            told = [
+                fault
+                for fault in found.faults
+                if fault.kind in HOLDS or suspect[list(fault.cells)].any()
+            ]
+            return replace(found, faults=tuple(told))
 
         whole = self._diagnosed(log, crosstalk=crosstalk)
         lengths = [len(given) for given in log.given]
         # without a reference, a part of a log tells less than the whole
         part = None if self.reference_ is None else of_part
         return with_recordings(whole, held, lengths, tolerance, part)
+
+    def _knows(self, some: tuple[int, ...], classes: ArrayLike | None) -> bool:
+        """Return whether the reference has enough recordings of each class that ``some`` recordings
+        of a log have: else it does not know how healthy cells move in them."""
+        if self._classes is None or classes is None:
+            return True
+        return self._classes.issuperset(np.asarray(classes)[list(some)].tolist())
 
     def spans(self, log: RecordingBlocks) -> Spans:
         """Return the range of the loads of each cell in each recording, each axis of a pad as a pad

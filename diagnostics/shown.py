@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from html import escape
 from typing import Any, TypeVar
 
 _WIDEST = 160  # characters
@@ -27,4 +26,6 @@ def _line(self: object) -> str:
 
 
 def _page(self: object) -> str:
+    from html import escape  # slow to import, and rarely needed
+
     return f"<pre>{escape(str(self))}</pre>"

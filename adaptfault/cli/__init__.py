@@ -3,7 +3,10 @@ line."""
 
 from __future__ import annotations
 
+import atexit
+import gc
 import logging
+import sys
 import traceback
 from collections.abc import Sequence
 from pkgutil import extend_path
@@ -17,6 +20,10 @@ from adaptfault.data.plugins import plugins, what_to_install
 from adaptfault.data.shortage import is_shortage
 
 __path__ = extend_path(__path__, __name__)  # the packages of the repository add commands
+
+# Python looks through all that is left for garbage when it ends, a sixth of the time of a short
+# command
+atexit.register(gc.freeze)
 
 GROUP = "adaptfault.commands"
 
@@ -50,8 +57,8 @@ BUILT_IN = {name: f"adaptfault.cli.{name}" for name in _NAMES}
 package adds one by a module with ``add(subparsers)`` and an entry point in the same group."""
 
 
-def _parser() -> Parser:
-    """Return the parser of all commands."""
+def _parser(only: str | None = None) -> Parser:
+    """Return the parser of all commands, or where there is one called ``only``, of that."""
     parser = Parser(
         prog="adaptfault",
         description=(
@@ -65,7 +72,7 @@ def _parser() -> Parser:
     parser.add_argument("--version", action="version", version=f"adaptfault {__version__}")
     parser.set_defaults(make=Foreign.of)
     commands = parser.add_subparsers(dest="command", metavar="COMMAND")
-    for module in plugins(GROUP, BUILT_IN).values():
+    for module in plugins(GROUP, BUILT_IN, only).values():
         module.add(commands)
     return parser
 
@@ -101,8 +108,9 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _run(argv: Sequence[str] | None) -> int:
-    parser = _parser()
-    args = parser.parse_args(argv)
+    given = sys.argv[1:] if argv is None else argv
+    parser = _parser(given[0] if given else None)
+    args = parser.parse_args(given)
     if args.command is None:
         parser.print_help()
         return 0

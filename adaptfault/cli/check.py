@@ -103,7 +103,12 @@ class Check(Inspecting):
     def _full(self, fails: FailOn | None) -> int:
         """Check a data set with a model of its cells."""
         from adaptfault.inspection.check_log import check_log
-        from adaptfault.inspection.groupings import coincide, data_sets_of, read_groupings
+        from adaptfault.inspection.groupings import (
+            coincide,
+            dividing,
+            groupings_of,
+            read_groupings,
+        )
         from adaptfault.inspection.naming import Naming
 
         if self.write_valid:
@@ -121,7 +126,7 @@ class Check(Inspecting):
         inspected = inspect_log(self, part)
         log = inspected.log
         report_range(log)
-        groupings = dict(data_sets_of(log, self.recordings))
+        groupings = dict(dividing(groupings_of(log, self.recordings)))
         if self.groups is not None:
             groupings |= read_groupings(self.groups, log.names)
         found = inspected.inspection
@@ -147,29 +152,34 @@ class Check(Inspecting):
 
     def _quick(self, fails: FailOn | None) -> int:
         """Check a data set in one pass, a part of it, or merged parts."""
-        from adaptfault.inspection.groupings import coincide, data_sets_of, read_groupings
+        from adaptfault.inspection.groupings import (
+            coincide,
+            dividing,
+            groupings_of,
+            read_groupings,
+        )
         from adaptfault.inspection.quick import quick, quick_check
         from adaptfault.inspection.quick_statistics import Statistics
 
         self._refuse_beside_quick()
         log: Opened | None = None
         n_recordings = 0
-        groupings: dict[str, Sequence[str]] = {}
         if self.merge:
             statistics = Statistics.joined([Statistics.load(path) for path in self.recordings])
         else:
-            whole = self.open(self.recordings)
-            self.say_inferred(whole.inferred)
-            log = self._part_of(whole)
-            n_recordings = len(whole)
-            statistics = Statistics.of(log, self.left_out)
+            is_part = bool(self.shard) or self.sample is not None
+            log = self.open(self.recordings, select=self._selected if is_part else None)
+            self.say_inferred(log.inferred)
+            n_recordings = log.n_found
+            divided = groupings_of(log, self.recordings)
+            statistics = Statistics.of(log, divided)
             report_range(log)
-            groupings |= data_sets_of(log, self.recordings)
         if self.shard:
             assert self.out is not None
             statistics.save(self.out)
             self.say(f"{len(statistics.naming.lengths)} recordings in {self.out}")
             return 0
+        groupings = dict(dividing(statistics.groupings))
         if self.groups is not None:
             groupings |= read_groupings(self.groups, statistics.naming.recordings)
         found = quick(statistics)
@@ -182,7 +192,8 @@ class Check(Inspecting):
         ]
         found = replace(found, inspection=replace(found.inspection, findings=tuple(findings)))
         source = ", ".join(self.recordings)
-        checked = quick_check(statistics, found, log, grouped=bool(groupings), source=source)
+        clock = None if log is None else log.clock
+        checked = quick_check(statistics, found, clock, grouped=bool(groupings), source=source)
         code = checked.severity if fails is None else checked.findings.failed(fails)
         notes = []
         if self.sample is not None and log is not None:
@@ -193,19 +204,18 @@ class Check(Inspecting):
         self._tell(checked, notes)
         return code
 
-    def _part_of(self, log: Opened) -> Opened:
-        """Return the recordings of a shard, or of a sample."""
+    def _selected(self, n: int) -> Sequence[int]:
+        """Return the numbers of the recordings of a shard, or of a sample, of ``n``."""
         if self.shard:
             number, of = _shard(self.shard)
-            ends = [len(log) * i // of for i in (number - 1, number)]
-            if ends[0] == ends[1]:
-                raise ValueError(f"--shard {self.shard}: the data set has {len(log)} recordings")
-            return log.select(range(*ends))
-        if self.sample is not None and self.sample < len(log):
-            import random
+            part = range(n * (number - 1) // of, n * number // of)
+            if not part:
+                raise ValueError(f"--shard {self.shard}: the data set has {n} recordings")
+            return part
+        assert self.sample is not None
+        import random
 
-            return log.select(random.Random(0).sample(range(len(log)), self.sample))
-        return log
+        return random.Random(0).sample(range(n), min(n, self.sample))
 
     def _refuse_beside_quick(self) -> None:
         """Raise ValueError where options cannot be meant together."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
@@ -179,12 +179,18 @@ class Reading(CalibratedArray):
         self.tell_problems(loaded.problems)
         return loaded
 
-    def open(self, paths: Sequence[str], layout: SensorLayout | None = None) -> Opened:
+    def open(
+        self,
+        paths: Sequence[str],
+        layout: SensorLayout | None = None,
+        select: Callable[[int], Iterable[int]] | None = None,
+    ) -> Opened:
         """Open recordings of any size, as the options state; the problems found so far are printed.
 
         Args:
             paths: files and folders.
             layout: as for :meth:`load`.
+            select: as for :func:`adaptfault.data.recordings.open_recordings`.
 
         Raises:
             ValueError: nothing could be read, or an option contradicts ``layout``.
@@ -197,6 +203,7 @@ class Reading(CalibratedArray):
                 labels=self.labels,
                 frames=self.frames,
                 progress=advance,
+                select=select,
                 **self._options_of_load(layout),
             )
         self.tell_problems(opened.problems)

@@ -5,8 +5,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cache
 from importlib import import_module
-from importlib.metadata import entry_points
+from importlib.metadata import EntryPoint, entry_points
 from typing import Any
 
 APART = {
@@ -26,7 +27,7 @@ def what_to_install(error: BaseException) -> str | None:
     return f"this needs {package}, which is not installed: pip install {package}"
 
 
-def plugins(group: str, built_in: Mapping[str, str]) -> dict[str, Any]:
+def plugins(group: str, built_in: Mapping[str, str], only: str | None = None) -> dict[str, Any]:
     """Return what is registered in an entry point group, by its name; an :class:`Apart` stands for
     what is not installed.
 
@@ -35,22 +36,39 @@ def plugins(group: str, built_in: Mapping[str, str]) -> dict[str, Any]:
         built_in: module of each part of the repository, in the order wanted; they are found without
             their entry points, too. Another package replaces one by an entry point of the same
             name; its own parts come behind.
+        only: name of the part that is wanted; None, or one that is not registered: all.
 
     Raises:
         ImportError: a part cannot be imported.
     """
     others = {
-        entry.name: entry
-        for entry in entry_points(group=group)
-        if built_in.get(entry.name) != entry.value
+        name: entry
+        for name, entry in _registered(group).items()
+        if built_in.get(name) != entry.value
     }
-    found: dict[str, Any] = dict.fromkeys(built_in)
-    for name, module in built_in.items():
-        if name not in others:
-            found[name] = _part(name, module)
-    for name, entry in others.items():
-        found[name] = entry.load()
-    return found
+    names = list(dict.fromkeys([*built_in, *others]))
+    wanted = [only] if only in names else names
+    return {
+        name: others[name].load() if name in others else _part(name, built_in[name])
+        for name in wanted
+    }
+
+
+def _registered(group: str) -> dict[str, EntryPoint]:
+    """Return the entry points of a group by their names."""
+    return {entry.name: entry for entry in _entry_points() if entry.group == group}
+
+
+@cache
+def _entry_points() -> tuple[EntryPoint, ...]:
+    """Return those of our groups; to look for them, each package that is installed is opened."""
+    known = entry_points()
+    return tuple(
+        entry
+        for group in known.groups
+        if group.startswith("adaptfault.")
+        for entry in known.select(group=group)
+    )
 
 
 def _part(name: str, module: str) -> Any:

@@ -11,8 +11,9 @@ from adaptfault.data.recordings import Opened, Recordings
 from adaptfault.data.recordings.facts.rates import Clock
 from adaptfault.data.recordings.load import PART
 from adaptfault.data.summary import summary_of
+from adaptfault.inspection.begins import Begins
 from adaptfault.inspection.code import Need
-from adaptfault.inspection.data_set import DataSetCheck, starts_and_tares
+from adaptfault.inspection.data_set import DataSetCheck
 from adaptfault.inspection.naming import Naming
 from adaptfault.inspection.result import Inspection
 from diagnostics.preprocessing.readings import RecordingBlocks
@@ -53,7 +54,8 @@ def check_log(
     in_memory = int(summary.lengths.sum()) * log.layout.n_cells <= PART
     if (log.labels is not None or grouped) and in_memory:
         given.add("classes")
-    begun, tared = starts_and_tares(recordings, log.names, log.layout)
+    begins = Begins.of(recordings(), log.layout)
+    begun, tared = begins.in_contact(log.names, log.layout)
     naming = Naming.of(log)
     return DataSetCheck(
         naming.of_inspection(inspection),

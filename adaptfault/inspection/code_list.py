@@ -379,7 +379,7 @@ CODES: tuple[Code, ...] = (
         "Recordings begin in contact.",
         "A driver that tares at the start takes the contact out.",
         "Harmless where nothing tares.",
-        method="adaptfault.inspection.data_set",
+        method="adaptfault.inspection.begins",
     ),
     Code(
         163,
@@ -387,7 +387,7 @@ CODES: tuple[Code, ...] = (
         "Readings fall below rest, as after zeroing in contact.",
         "The same contact has another value in these recordings.",
         "Needs three recordings.",
-        method="adaptfault.inspection.data_set",
+        method="adaptfault.inspection.begins",
     ),
     Code(
         164,

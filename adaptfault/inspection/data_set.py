@@ -3,20 +3,12 @@
 Beside an inspection of the cells, told are: missing readings and cells that never change; lost
 frames and jitter of the clock; recordings that begin in contact, where a driver that tares at the
 start takes the contact out; and recordings whose readings go to the other side of rest, where one
-did.
-
-With s the median over the recordings of the mean of the first readings of each cell, l_i(t) the
-mean over the cells of the readings minus s, signed so that load rises, L the median over the
-recordings of the lowest l_i, and p that of the highest minus the lowest, a recording begins in
-contact where l_i(0) exceeds L by 30 % of p. It was tared in contact where it begins at L, and goes
-10 % of p below: of three recordings or more, most of which begin at their lowest. Recordings agree
-more in what they read without load than with it, which shows the sign. Not detected: zeroing in
-contact whose readings are cut off at 0, and one where most recordings begin in contact.
+did (:mod:`adaptfault.inspection.begins`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from typing import Any, Literal
@@ -34,7 +26,6 @@ from adaptfault.inspection.naming import Naming
 from adaptfault.inspection.result import Finding, Inspection
 from adaptfault.inspection.severity import Name, of_finding
 from diagnostics import SensorLayout
-from diagnostics.preprocessing.levels import MAJORITY
 from diagnostics.when import reads_enough
 
 SCHEMA = "adaptfault.check/1"
@@ -42,10 +33,6 @@ SCHEMA = "adaptfault.check/1"
 Level = Literal["full", "quick"]
 """How much is tested."""
 
-_FIRST = 3  # frames of a recording from which its begin is taken
-_IN_CONTACT = 0.3  # of the median peak, as the begin of a contact event
-_BELOW = 0.1  # of the median peak, on the other side of rest
-_RECORDINGS = 3  # that show what rest is
 _JITTER = 0.2  # of the period: times say less about lost frames from here on
 _LISTED = 5
 _FILES = "recordings or files could not be read: left out"
@@ -222,76 +209,6 @@ aria-label="tactile cells: {text}">
 </g>
 </svg>
 """
-
-
-def starts_and_tares(
-    recordings: Callable[[], Iterable[NDArray[Any]]], names: Sequence[str], layout: SensorLayout
-) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return the names of the recordings that begin in contact, and of those that were tared in
-    contact.
-
-    Args:
-        recordings: yields them, ``[T, D]`` each, every time it is called.
-        names: of each.
-        layout: the array.
-    """
-    present = layout.present.ravel()
-    starts = np.array([_mean(frames[:_FIRST, present]) for frames in recordings()])
-    origin = np.nan_to_num(_median(starts))
-    begins = np.nan_to_num(starts - origin).mean(axis=1)
-    ends = np.zeros((len(starts), 2))
-    at_zero = np.zeros((len(starts), 2))
-    usual = np.zeros(len(starts))
-    floor = np.full(int(present.sum()), np.inf)
-    for i, frames in enumerate(recordings()):
-        loads = np.nan_to_num(frames[:, present] - origin).mean(axis=1)
-        extremes = [int(loads.argmin()), int(loads.argmax())]
-        ends[i] = loads[extremes]
-        usual[i] = np.median(loads)
-        floor = np.fmin(floor, np.fmin.reduce(frames[:, present]))
-        at_zero[i] = (frames[extremes][:, present] == 0).mean(axis=1)
-    peak = float(np.median(ends[:, 1] - ends[:, 0]))
-    if not peak > 0:
-        return (), ()
-    if len(starts) >= _RECORDINGS:  # they agree in rest
-        from_rest = [_spread(end) for end in ends.T]
-    elif (floor == 0).mean() > MAJORITY:
-        from_rest = [0.0, 1.0]
-    else:  # most frames are at rest
-        from_rest = [float(np.median(np.abs(usual - end))) for end in ends.T]
-    rests = int(np.argmin(from_rest))
-    sign = 1 - 2 * rests
-    lowest = sign * ends[:, rests]
-    rest = np.median(lowest)
-    begins = sign * begins
-    begun = begins - rest > _IN_CONTACT * peak
-    is_usual = begins - lowest <= _BELOW * peak
-    # a sensor that reads 0 is not below its rest
-    is_below = (lowest < rest - _BELOW * peak) & (at_zero[:, rests] < MAJORITY)
-    many = len(starts) >= _RECORDINGS and is_usual.mean() > MAJORITY
-    every = np.array(names, dtype=object)
-    return tuple(every[begun]), tuple(every[is_below & ~is_usual & ~begun & many])
-
-
-def _spread(values: NDArray[np.float64]) -> float:
-    """Return the median distance from the median."""
-    return float(np.median(np.abs(values - np.median(values))))
-
-
-def _mean(frames: NDArray[Any]) -> NDArray[np.float64]:
-    """Return the mean of each cell; NaN where it has no reading."""
-    known = np.isfinite(frames)
-    total = np.where(known, frames, 0.0).sum(axis=0)
-    counts = known.sum(axis=0)
-    return np.where(counts > 0, total / np.maximum(counts, 1), np.nan)
-
-
-def _median(starts: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the median of each column; NaN where it has none."""
-    known = ~np.isnan(starts).all(axis=0)
-    median = np.full(starts.shape[1], np.nan)
-    median[known] = np.nanmedian(starts[:, known], axis=0)
-    return median
 
 
 def _counted(names: Sequence[str]) -> str:

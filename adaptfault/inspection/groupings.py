@@ -2,7 +2,8 @@
 
 A fault often begins with one of them, and a model learns it for whatever goes along. A table states
 them, a row a recording: its name as ``check`` tells it, and one column for each division. Several
-data sets that are checked together are a division by themselves.
+data sets that are checked together are a division by themselves, and so are the robots that files
+state.
 """
 
 from __future__ import annotations
@@ -23,6 +24,9 @@ from diagnostics import Diagnosis
 
 RECORDING = "recording"
 """The column with the name of a recording."""
+
+UNKNOWN = "unknown"
+"""Where a recording belongs of which nothing is stated."""
 
 Groupings = Mapping[str, Sequence[str]]
 """For each division, where each recording belongs."""
@@ -60,15 +64,38 @@ def read_groupings(path: str | Path, names: Sequence[str]) -> Groupings:
     return {name: [of[one][name] for one in names] for name in columns}
 
 
-def data_sets_of(log: Opened, given: Sequence[str]) -> Groupings:
-    """Return from which of the ``given`` paths each recording is; nothing where there is one."""
+def groupings_of(log: Opened, given: Sequence[str]) -> Groupings:
+    """Return from which of the ``given`` paths each recording is, and from which robot, where files
+    state it."""
+    robots = [one.device or one.facts.device for one in log.origins]
+    stated = {"robot": [one or UNKNOWN for one in robots]} if any(robots) else {}
+    return {"data set": _data_sets_of(log, given), **stated}
+
+
+def joined(parts: Sequence[tuple[Groupings, int]]) -> Groupings:
+    """Return the divisions of parts of a data set, one behind the other; each with how many
+    recordings it has."""
+    names = dict.fromkeys(name for groupings, _ in parts for name in groupings)
+    return {
+        name: [one for given, n in parts for one in given.get(name, [UNKNOWN] * n)]
+        for name in names
+    }
+
+
+def dividing(groupings: Groupings) -> Groupings:
+    """Return the divisions in which not all recordings belong together."""
+    return {name: values for name, values in groupings.items() if len(set(values)) > 1}
+
+
+def _data_sets_of(log: Opened, given: Sequence[str]) -> list[str]:
+    """Return from which of the ``given`` paths each recording is."""
     places = [paths.realpath(one) for one in given]
     found = []
     for origin in log.origins:
         of = paths.realpath(origin.facts.path)
         within = [i for i, place in enumerate(places) if of == place or _is_in(of, place)]
         found.append(given[within[0]] if within else str(origin.facts.path))
-    return {"data set": found} if len(set(found)) > 1 else {}
+    return found
 
 
 def coincide(diagnosis: Diagnosis, groupings: Groupings) -> list[Finding]:

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from adaptfault.data.recordings.facts.rates import Clock
 from adaptfault.inspection.changed_readings import ChangedReadings
 from adaptfault.inspection.code import Need
-from adaptfault.inspection.data_set import DataSetCheck, starts_and_tares
+from adaptfault.inspection.data_set import DataSetCheck
 from adaptfault.inspection.findings import Unchecked
 from adaptfault.inspection.result import Inspection, faults_and_frames, finding_of
 from adaptfault.inspection.severity import UNTESTED
@@ -36,11 +36,10 @@ from diagnostics.preprocessing.tolerance import tolerance_of
 from diagnostics.when import find_held
 
 if TYPE_CHECKING:
-    from adaptfault.data.recordings import Opened, Recordings
     from adaptfault.inspection.quick_statistics import Statistics
 
 _LISTED = 5
-_OF_FRAMES = "begins and tares in contact, and times: parts that are merged do not hold them"
+_OF_FRAMES = "times of the frames: parts that are merged do not hold them"
 
 Bools = NDArray[np.bool_]
 
@@ -135,7 +134,7 @@ def quick(statistics: Statistics) -> Quick:
 def quick_check(
     statistics: Statistics,
     found: Quick,
-    log: Opened | Recordings | None,
+    clock: Clock | None,
     *,
     grouped: bool = False,
     source: str = "",
@@ -145,20 +144,16 @@ def quick_check(
     Args:
         statistics: of its recordings.
         found: from them.
-        log: the data set; None: merged parts, of which begins and times are not known.
+        clock: of its frames; None: they are merged parts, of which it is not known.
         grouped: whether anything else than classes divides the recordings.
         source: what the data set is called.
     """
-    begun: tuple[str, ...] = ()
-    tared: tuple[str, ...] = ()
-    clock = Clock()
-    left = found.unchecked
     naming = statistics.naming
-    if log is not None:
-        begun, tared = starts_and_tares(lambda: iter(log), log.names, log.layout)
-        clock = getattr(log, "clock", clock)
-    else:
-        left += (Unchecked(_OF_FRAMES, ("TOUCH-162", "TOUCH-163")),)
+    begun, tared = statistics.begins.in_contact(naming.recordings, statistics.layout)
+    left = found.unchecked
+    if clock is None:
+        clock = Clock()
+        left += (Unchecked(_OF_FRAMES, ("TOUCH-147", "TOUCH-148", "TOUCH-149")),)
     given: set[Need] = set()
     if clock.jitter is not None:
         given.add("times")
@@ -168,7 +163,7 @@ def quick_check(
         naming.of_inspection(found.inspection),
         statistics.summary,
         clock,
-        statistics.left_out,
+        len(statistics.unread),
         begun,
         tared,
         frozenset(given),

@@ -2,9 +2,9 @@
 them one behind the other.
 
 Of each recording: the range of each cell, sums that tell whether it moves with those beside it
-(:mod:`diagnostics.when.together`), five frames that tell the direction of load and the step of the
-converter; and of all how often frames repeat. The size depends on the number of recordings, not on
-that of frames.
+(:mod:`diagnostics.when.together`), how it begins (:mod:`adaptfault.inspection.begins`), five frames
+that tell the direction of load and the step of the converter; and of all how often frames repeat.
+The size depends on the number of recordings, not on that of frames.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from __future__ import annotations
 import io
 import json
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from itertools import chain
 from os import PathLike
 from pathlib import Path
@@ -26,6 +26,8 @@ from adaptfault.data.atomic import atomic_write
 from adaptfault.data.recordings import Opened, Recordings
 from adaptfault.data.recordings.errors import InputError
 from adaptfault.data.summary import Summary
+from adaptfault.inspection.begins import Begins, Begun
+from adaptfault.inspection.groupings import Groupings, joined
 from adaptfault.inspection.naming import Naming, classes_of
 from diagnostics import SensorLayout
 from diagnostics.preprocessing.readings import RecordingBlocks
@@ -33,7 +35,7 @@ from diagnostics.sensor.repeated_frames import Repetitions
 from diagnostics.when import Spans
 from diagnostics.when.together import Together
 
-SCHEMA = "adaptfault.quick/1"
+SCHEMA = "adaptfault.quick/2"
 
 _KEPT = 5  # frames of each recording, evenly spread
 
@@ -48,10 +50,12 @@ class Statistics:
         classes: of each recording; None: unknown.
         spans: ranges of the readings.
         together: sums.
+        begins: how they begin.
         sample: float32 ``[n, 5, D]``, frames of each.
         missing: int ``[D]``, readings.
         repetitions: of frames.
-        left_out: recordings and files that could not be read.
+        groupings: what else divides the recordings.
+        unread: why recordings and files could not be read.
     """
 
     layout: SensorLayout
@@ -59,13 +63,15 @@ class Statistics:
     classes: tuple[str, ...] | None
     spans: Spans
     together: Together
+    begins: Begins
     sample: NDArray[np.float32]
     missing: NDArray[np.int64]
     repetitions: Repetitions
-    left_out: int = 0
+    groupings: Groupings
+    unread: tuple[str, ...] = ()
 
     @classmethod
-    def of(cls, log: Opened | Recordings, left_out: int = 0) -> Statistics:
+    def of(cls, log: Opened | Recordings, groupings: Groupings | None = None) -> Statistics:
         """Return the statistics of a data set, read once."""
         layout = log.layout
         naming = Naming.of(log)
@@ -74,6 +80,7 @@ class Statistics:
         together = []
         pieces = []
         repetitions = []
+        begun: list[Begun] = []
         sample = np.full((len(naming.lengths), _KEPT, layout.n_cells), np.nan, np.float32)
         missing = np.zeros(layout.n_cells, np.int64)
         for number, first, frames in _pieces(log, naming.lengths):
@@ -82,6 +89,9 @@ class Statistics:
             together.append(Together.of(valid.given, layout))
             pieces.append(len(frames))
             repetitions.append(Repetitions.of(frames[:, present]))
+            if not first:
+                begun.append(Begun(layout))
+            begun[-1].add(frames)
             missing += np.isnan(valid.given[0]).sum(axis=0)
             kept = np.linspace(0, naming.lengths[number] - 1, _KEPT).astype(int) - first
             here = (kept >= 0) & (kept < len(frames))
@@ -93,10 +103,12 @@ class Statistics:
             None if classes is None else tuple(classes),
             Spans.joined(spans).whole(pieces, naming.lengths),
             Together.joined(together).whole(pieces, naming.lengths),
+            Begins.joined([one.begins() for one in begun]),
             sample,
             missing,
             Repetitions.joined(repetitions),
-            left_out,
+            groupings or {},
+            tuple(one.message for one in getattr(log, "problems", ()) if one.level == "error"),
         )
 
     @classmethod
@@ -124,10 +136,12 @@ class Statistics:
             classes,
             Spans.joined([part.spans for part in parts]),
             Together.joined([part.together for part in parts]),
+            Begins.joined([part.begins for part in parts]),
             np.concatenate([part.sample for part in parts]),
             np.sum([part.missing for part in parts], axis=0),
             Repetitions.joined([part.repetitions for part in parts]),
-            sum(part.left_out for part in parts),
+            joined([(part.groupings, len(part.naming.lengths)) for part in parts]),
+            tuple(dict.fromkeys(one for part in parts for one in part.unread)),
         )
 
     @property
@@ -167,7 +181,8 @@ class Statistics:
             "classes": self.classes,
             "frames": self.repetitions.frames,
             "repeated": self.repetitions.repeated,
-            "left_out": self.left_out,
+            "groupings": {name: list(one) for name, one in self.groupings.items()},
+            "unread": self.unread,
         }
         stored = io.BytesIO()
         np.savez_compressed(
@@ -179,6 +194,7 @@ class Statistics:
             sample=self.sample,
             missing=self.missing,
             between=self.repetitions.between,
+            **{f"begins_{name}": values for name, values in vars(self.begins).items()},
         )
         atomic_write(path, stored.getvalue())
 
@@ -204,10 +220,12 @@ class Statistics:
                     None if classes is None else tuple(classes),
                     Spans(held["low"], held["high"]),
                     Together(held["sums"]),
+                    Begins(*(held[f"begins_{field.name}"] for field in fields(Begins))),
                     held["sample"],
                     held["missing"],
                     counted,
-                    about["left_out"],
+                    about["groupings"],
+                    tuple(about["unread"]),
                 )
         except (OSError, ValueError, KeyError, TypeError, BadZipFile) as error:
             what = "is no part of a check, or is damaged; write it again with check --shard"

@@ -29,7 +29,8 @@ if TYPE_CHECKING:
 
 _LISTED = 5  # places in a sentence
 _PARTS = 4  # sets of recordings that are diagnosed, at most: a size
-_HOLDS = (FaultKind.OPEN, FaultKind.SHORT, FaultKind.STUCK, FaultKind.INTERMITTENT)
+HOLDS = (FaultKind.OPEN, FaultKind.SHORT, FaultKind.STUCK)
+_COMES = (*HOLDS, FaultKind.INTERMITTENT)
 
 Cells = NDArray[np.intp]
 Recordings = tuple[int, ...]
@@ -152,7 +153,7 @@ def _located(fault: Fault, held: Held, first: Sequence[int]) -> Fault:
     recordings = np.flatnonzero(each)
     last = len(each) - 1
     lasts = len(recordings) == 0 or len(recordings) == last - recordings[0] + 1
-    if lasts or fault.kind not in _HOLDS:
+    if lasts or fault.kind not in _COMES:
         return fault
     shown = replace(fault, recordings=tuple(recordings.tolist()), onset=first[recordings[0]])
     return _told(shown, last)

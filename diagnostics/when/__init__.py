@@ -20,7 +20,12 @@ faults within a recording.
 
 from diagnostics.when.filling import filled
 from diagnostics.when.held import Held, find_held
-from diagnostics.when.own_reference import OWN_REFERENCE, own_reference, reads_enough
+from diagnostics.when.own_reference import (
+    OWN_REFERENCE,
+    known_classes,
+    own_reference,
+    reads_enough,
+)
 from diagnostics.when.spans import Spans
 
 __all__ = [
@@ -29,6 +34,7 @@ __all__ = [
     "Spans",
     "filled",
     "find_held",
+    "known_classes",
     "own_reference",
     "reads_enough",
 ]

@@ -46,11 +46,14 @@ class Lasting:
         faulty = self._begins[0] + ratio[0]
         back = np.zeros((2, *ratio.shape), bool)
         for t in range(1, len(ratio)):
-            back[0, t] = faulty + self._ends > healthy + self._stays[t]
-            back[1, t] = faulty + self._lasts > healthy + self._begins[t]
-            was = healthy
-            healthy = np.maximum(healthy + self._stays[t], faulty + self._ends)
-            faulty = np.maximum(was + self._begins[t], faulty + self._lasts) + ratio[t]
+            stays = healthy + self._stays[t]
+            ends = faulty + self._ends
+            begins = healthy + self._begins[t]
+            lasts = faulty + self._lasts
+            np.greater(ends, stays, out=back[0, t])
+            np.greater(lasts, begins, out=back[1, t])
+            healthy = np.maximum(stays, ends)
+            faulty = np.maximum(begins, lasts) + ratio[t]
         states = np.zeros(ratio.shape, bool)
         states[-1] = faulty > healthy
         for t in range(len(ratio) - 1, 0, -1):

@@ -11,12 +11,12 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-_LOG_GAMMA = np.vectorize(math.lgamma, otypes=[np.float64])
-
 
 def log_gamma(x: ArrayLike) -> NDArray[np.float64]:
     """Return log gamma(x) of positive numbers, in their shape."""
-    return np.asarray(_LOG_GAMMA(x))
+    given = np.asarray(x, np.float64)
+    each = map(math.lgamma, given.ravel().tolist())
+    return np.fromiter(each, np.float64, given.size).reshape(given.shape)
 
 
 def log_beta(a: ArrayLike, b: ArrayLike) -> NDArray[np.float64]:

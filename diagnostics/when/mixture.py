@@ -12,7 +12,7 @@ from enum import IntEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from diagnostics.preprocessing.levels import EXPECTED, FEWEST, LEAST_LOADED, MAJORITY
+from diagnostics.preprocessing.levels import EXPECTED, FEWEST, LEAST_LOADED, LOW, MAJORITY
 from diagnostics.when.chain import Course, Lasting, Loose
 from diagnostics.when.log_gamma import log_gamma
 
@@ -130,16 +130,15 @@ class Mixture:
     ) -> Found:
         """Return the likeliest of all orders."""
         table = _probabilities(pooled)
-        concentration = max(
-            _CONCENTRATIONS, key=lambda size: float(_marginal(counts, size * table).sum())
-        )
-        prior = concentration * table
-        healthy = _marginal(self._counts(context, known), prior)
+        priors = [size * table for size in _CONCENTRATIONS]
+        likely = [float(each.sum()) for each in _marginals(counts, priors)]
+        prior = priors[int(np.argmax(likely))]
+        (healthy,) = _marginals(self._counts(context, known), [prior])
         best = Found(np.full(len(counts), -np.inf), np.zeros(known.shape, bool))
         for order, course in self._courses:
             states = self._states(context, known, prior, order, course)
             dead = np.where(states & known, _DEAD[self._symbol], 0.0).sum(axis=0)
-            rest = _marginal(self._counts(context, known & ~states), prior)
+            (rest,) = _marginals(self._counts(context, known & ~states), [prior])
             usual = np.maximum(healthy, rest + self._untouched(context, known, table, states))
             gain = self._independent * (rest + dead - usual) + course.prior(states[order])
             evidence = np.where(states.any(axis=0), gain, -np.inf)
@@ -196,18 +195,26 @@ class Mixture:
         """Return the share of the recordings that count as independent of each other.
 
         It is the variance of the sum of single recordings over that of successive ones, in the
-        order in which they are most alike.
+        order in which they are most alike, both about the mean of each unit. The units that deviate
+        most together do not count: what is dead in some recordings does, and would hide itself.
         """
         rate = counts + _probabilities(pooled)
         rate /= rate.sum(axis=2, keepdims=True)
         holds = 1 - rate[self._unit, context, Symbol.MOVED]
         deviation = np.where(counted, (self._symbol != Symbol.MOVED) - holds, 0.0)
-        alone = float((deviation**2).sum())
+        usual = deviation.sum(axis=0) / np.maximum(counted.sum(axis=0), 1)
+        deviation = np.where(counted, deviation - usual, 0.0)
+        alone = (deviation**2).sum(axis=0)
+        begins = np.arange(0, len(deviation), FEWEST)
+        used = max(1, round((1 - 2 * LOW) * len(alone)))
         share = 1.0
         for order, _ in self._courses:
-            begins = np.arange(0, len(deviation), FEWEST)
-            together = float((np.add.reduceat(deviation[order], begins, axis=0) ** 2).sum())
-            share = min(share, alone / max(together, np.finfo(float).tiny))
+            together = (np.add.reduceat(deviation[order], begins, axis=0) ** 2).sum(axis=0)
+            counts_on = np.argsort(together - alone, kind="stable")[:used]
+            of_single = float(alone[counts_on].sum())
+            of_several = float(together[counts_on].sum())
+            if of_several > of_single:
+                share = min(share, of_single / of_several)
         return share
 
 
@@ -226,16 +233,50 @@ def _probabilities(counts: Floats) -> Floats:
     return np.column_stack([moving, (1 - moving)[:, None] * each])
 
 
-def _marginal(counts: Floats, prior: Floats) -> Floats:
+def _marginals(counts: Floats, priors: Sequence[Floats]) -> list[Floats]:
     """Return the log marginal likelihood (Dirichlet-multinomial) of counts
-    ``[units, C, symbols]``, ``[units]``; prior: pseudo-counts ``[C, symbols]``."""
-    total = np.zeros(len(counts))
-    of_unit, of_context, of_symbol = np.nonzero(counts)
-    size = prior[of_context, of_symbol]
-    gained = log_gamma(size + counts[of_unit, of_context, of_symbol]) - log_gamma(size)
-    np.add.at(total, of_unit, gained)
-    sums = counts.sum(axis=2)
-    of_unit, of_context = np.nonzero(sums)
-    size = prior.sum(axis=1)[of_context]
-    np.add.at(total, of_unit, log_gamma(size) - log_gamma(size + sums[of_unit, of_context]))
-    return total
+    ``[units, C, symbols]`` with each prior, pseudo-counts ``[C, symbols]``: ``[units]`` each.
+
+    The gamma function is asked once for what units have in common.
+    """
+    times = counts.sum(axis=2)
+    each = _Repeated.of(counts)
+    of_all = _Repeated.of(times)
+    return [each.gained(prior) - of_all.gained(prior.sum(axis=1)) for prior in priors]
+
+
+@dataclass(frozen=True)
+class _Repeated:
+    """Counts of units that are not 0, each kind of them once.
+
+    Attributes:
+        units: number of all.
+        unit: int ``[n]``, of each count.
+        kind: int ``[n]``, of each count.
+        place: int ``[kinds]``, where a count stands in the counts of its unit.
+        count: float ``[kinds]``.
+    """
+
+    units: int
+    unit: NDArray[np.intp]
+    kind: NDArray[np.intp]
+    place: NDArray[np.intp]
+    count: Floats
+
+    @classmethod
+    def of(cls, counts: Floats) -> _Repeated:
+        """Return those of counts ``[units, ...]``, whole numbers."""
+        flat = counts.reshape(len(counts), -1)
+        unit, place = np.nonzero(flat)
+        size = int(flat.max(initial=0)) + 1
+        keys, kind = np.unique(
+            place * size + flat[unit, place].astype(np.intp), return_inverse=True
+        )
+        return cls(len(counts), unit, kind, keys // size, (keys % size).astype(np.float64))
+
+    def gained(self, prior: Floats) -> Floats:
+        """Return the sum of log gamma(prior + count) - log gamma(prior) of each unit."""
+        before = prior.ravel()[self.place]
+        gain = log_gamma(before + self.count) - log_gamma(before)
+        found: Floats = np.bincount(self.unit, gain[self.kind], self.units).astype(np.float64)
+        return found

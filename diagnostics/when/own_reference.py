@@ -12,12 +12,13 @@ Not detected: worn cells beside worn ones, and a contact of their own.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from diagnostics.preprocessing.levels import MAJORITY
+from diagnostics.preprocessing.levels import LEAST_LOADED, MAJORITY
 from diagnostics.preprocessing.quantiles import known_quantile
 from diagnostics.preprocessing.readings import RecordingBlocks
 from diagnostics.when.held import Held
@@ -48,6 +49,21 @@ def own_reference(log: RecordingBlocks, held: Held, classes: ArrayLike | None) -
     others = [i for i in np.flatnonzero(clean).tolist() if i not in chosen]
     chosen += others[: max(0, n // 2 - len(chosen))]
     return sorted(chosen)
+
+
+def known_classes(chosen: Sequence[int], classes: ArrayLike) -> frozenset[Any]:
+    """Return the classes of which a quarter of the recordings are in a reference: how healthy cells
+    move in those of another class is not known.
+
+    Args:
+        chosen: numbers of the recordings in the reference.
+        classes: of all recordings, ``[n]``.
+    """
+    label = np.asarray(classes)
+    own = label[list(chosen)]
+    names = np.unique(label)
+    known = [(own == name).sum() >= LEAST_LOADED * (label == name).sum() for name in names]
+    return frozenset(names[known].tolist())
 
 
 def reads_enough(ranges: NDArray[np.float64], layout: SensorLayout) -> NDArray[np.bool_]:

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 _CORRELATED = 0.5
 _RECORDINGS = 3
-_BLOCK = 1 << 20  # readings that are summed at a time: a size
+_BLOCK = 1 << 16  # readings that are summed at a time, as they fit into a cache: a size
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -105,24 +105,25 @@ class Together:
 
 def _sums(frames: Floats, layout: SensorLayout) -> Floats:
     """Return the sums of some frames, ``[6, D]``."""
-    known = np.isfinite(frames)
-    complete = bool(known.all())
-    values = frames if complete else np.where(known, frames, 0.0)
-    total = np.zeros(frames.shape)
-    count: NDArray[Any] = (layout.beside >= 0).sum(axis=1)
-    if not complete:
-        count = np.zeros(frames.shape)
+    # a row a cell, as neighbours are then whole rows; the last one stands for no cell, which is -1
+    cells = np.zeros((frames.shape[1] + 1, len(frames)))
+    cells[:-1] = frames.T
+    known = np.isfinite(cells)
+    values = np.where(known, cells, 0.0)
+    known[-1] = False
+    total = np.zeros(frames.T.shape)
+    count = np.zeros(frames.T.shape)
     for other in layout.beside.T:
-        here = np.flatnonzero(other >= 0)
-        total[:, here] += values[:, other[here]]
-        if not complete:
-            count[:, here] += known[:, other[here]]
+        total += values[other]
+        count += known[other]
+    known = known[:-1]
+    values = values[:-1]
     beside = total / np.maximum(count, 1)
     both = known & (count > 0)
     x = np.where(both, values, 0.0)
     m = np.where(both, beside, 0.0)
-    squares = np.einsum("td,td->d", x, x)
-    squares_beside = np.einsum("td,td->d", m, m)
-    products = np.einsum("td,td->d", x, m)
-    counts = both.sum(axis=0)
-    return np.stack([counts, x.sum(axis=0), squares, m.sum(axis=0), squares_beside, products])
+    squares = np.einsum("dt,dt->d", x, x)
+    squares_beside = np.einsum("dt,dt->d", m, m)
+    products = np.einsum("dt,dt->d", x, m)
+    counts = both.sum(axis=1)
+    return np.stack([counts, x.sum(axis=1), squares, m.sum(axis=1), squares_beside, products])

@@ -12,7 +12,8 @@ from adaptfault.data.recordings import load
 from adaptfault.data.recordings.facts.rates import Elapsed
 from adaptfault.data.recordings.valid import valid_masks, write_valid
 from adaptfault.data.summary import summarise
-from adaptfault.inspection.data_set import DataSetCheck, starts_and_tares
+from adaptfault.inspection.begins import Begins
+from adaptfault.inspection.data_set import DataSetCheck
 from adaptfault.inspection.inspection import inspect
 from diagnostics import Fault, SelfDiagnosis, SensorLayout, inject
 
@@ -31,7 +32,8 @@ def contacts(n: int = 8, seed: int = 0) -> list[np.ndarray]:
 
 
 def starts(recordings: list[np.ndarray]) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    return starts_and_tares(lambda: recordings, [f"{i}" for i in range(len(recordings))], LAYOUT)
+    names = [f"{i}" for i in range(len(recordings))]
+    return Begins.of(recordings, LAYOUT).in_contact(names, LAYOUT)
 
 
 @pytest.fixture
@@ -149,7 +151,7 @@ def test_whoever_trains_is_told_everything_in_sentences():
         summarise(recordings, LAYOUT, lengths=[len(one) for one in recordings]),
         Elapsed().clock(),
         2,
-        *starts_and_tares(lambda: recordings, names, LAYOUT),
+        *Begins.of(recordings, LAYOUT).in_contact(names, LAYOUT),
     )
     text = "\n".join(check.remarks)
     assert "2 recordings or files could not be read" in text

@@ -129,3 +129,18 @@ def test_a_fault_keeps_its_recordings_in_a_document():
     assert "recordings" not in Fault(FaultKind.OPEN, (3,)).to_dict()
     with pytest.raises(ValueError, match="expected a fault"):
         Fault.from_dict({"kind": "open", "cells": [3], "recordings": ["first"]})
+
+
+@pytest.mark.parametrize("seed", [4, 7])
+def test_what_moves_in_a_class_that_the_reference_lacks_is_not_blamed_for_it(seed):
+    layout = SensorLayout(1, 8, 8, full_scale=3.3, rate=20.0)
+    classes = ("nothing", "normal", "softer", "harder")
+    made = simulate(12, layout, n_frames=60, seed=seed, classes=classes)
+    order = np.argsort(np.arange(len(made.frames)) % 12, kind="stable")  # in turn
+    log = [np.array(made.frames[i], np.float64) for i in order]
+    rng = np.random.default_rng(seed)
+    for one, label in zip(log, made.labels[order], strict=True):
+        if classes[label] == "harder" and rng.random() < 0.94:
+            one[:, [18, 29, 44, 51]] = 0.61
+    diagnosis = SelfDiagnosis(layout).diagnose(log, classes=made.labels[order])
+    assert set(diagnosis.fault_set) == {18, 29, 44, 51}

@@ -7,7 +7,7 @@ import pytest
 
 from adaptfault.cli import main
 from adaptfault.data.recordings import Recordings, open_recordings, save_npz
-from adaptfault.inspection.groupings import coincide, data_sets_of, read_groupings
+from adaptfault.inspection.groupings import coincide, dividing, groupings_of, read_groupings
 from adaptfault.inspection.naming import Naming
 from diagnostics import Diagnosis, Fault, SensorLayout, Verdict
 
@@ -65,12 +65,13 @@ def test_several_data_sets_are_a_division_and_their_recordings_keep_apart(tmp_pa
         save_npz(tmp_path / name / f"{name}.npz", Recordings(frames, LAYOUT, names=("x", "y")))
     paths = [str(tmp_path / name) for name in ("one", "two")]
     log = open_recordings(paths)
-    assert data_sets_of(log, paths) == {"data set": [paths[0]] * 2 + [paths[1]] * 2}
-    assert data_sets_of(open_recordings(paths[:1]), paths[:1]) == {}
+    assert groupings_of(log, paths) == {"data set": [paths[0]] * 2 + [paths[1]] * 2}
+    assert dividing(groupings_of(open_recordings(paths[:1]), paths[:1])) == {}
     assert len(set(Naming.of(log).recordings)) == 4
 
 
-def test_check_tells_what_the_table_states(tmp_path, capsys):
+def contacts() -> list[np.ndarray]:
+    """40 recordings, in the later half of which cell 7 is dead."""
     rng = np.random.default_rng(0)
     course = np.maximum(np.sin(np.linspace(-0.5, np.pi + 0.5, 60)), 0)[:, None]
     frames = [
@@ -78,6 +79,53 @@ def test_check_tells_what_the_table_states(tmp_path, capsys):
     ]
     for one in frames[20:]:
         one[:, 7] = 0.1
+    return frames
+
+
+def with_robots(path, frames):
+    """Write recordings of two robots, the later half of the second one."""
+    robots = ["ab"[i >= len(frames) // 2] for i in range(len(frames))]
+    if path.suffix == ".h5":
+        with pytest.importorskip("h5py").File(path, "w") as file:
+            for i, (one, robot) in enumerate(zip(frames, robots, strict=True)):
+                file[f"data/demo_{i}/tactile"] = one.reshape(-1, 3, 4)
+                file[f"data/demo_{i}"].attrs["robot_id"] = robot
+        return path
+    pa = pytest.importorskip("pyarrow")
+    parquet = pytest.importorskip("pyarrow.parquet")
+    lengths = [len(one) for one in frames]
+    columns = {
+        "tactile": np.concatenate(frames).tolist(),
+        "episode_index": np.repeat(np.arange(len(frames)), lengths),
+        "robot": np.repeat(robots, lengths).tolist(),
+    }
+    parquet.write_table(pa.table(columns), path)
+    return path
+
+
+@pytest.mark.parametrize("ending", [".h5", ".parquet"])
+def test_robots_that_a_file_states_are_a_division_whole_and_in_parts(ending, tmp_path, capsys):
+    path = str(with_robots(tmp_path / f"set{ending}", contacts()))
+    stated = ("--shape", "3x4", "--full-scale", "1")
+    assert groupings_of(open_recordings(path, shape="3x4"), [path])["robot"] == [
+        *"a" * 20,
+        *"b" * 20,
+    ]
+    parts = [str(tmp_path / f"{i}.npz") for i in (1, 2, 3)]
+    for i, part in enumerate(parts, 1):
+        assert main(["check", path, *stated, "--shard", f"{i}/3", "--out", part, "--quiet"]) == 0
+    capsys.readouterr()
+    told = []
+    for arguments in (["check", path, *stated, "--quick"], ["check", "--merge", *parts]):
+        main([*arguments, "--quiet", "--json"])
+        told.append(json.loads(capsys.readouterr().out))
+    (reason,) = (one["reason"] for one in told[0]["findings"] if one["code"] == "TOUCH-160")
+    assert "coincides with robot b and no other" in reason
+    assert told[1]["findings"] == told[0]["findings"]
+
+
+def test_check_tells_what_the_table_states(tmp_path, capsys):
+    frames = contacts()
     (tmp_path / "set").mkdir()
     save_npz(tmp_path / "set/set.npz", Recordings(tuple(frames), LAYOUT))
     names = open_recordings(tmp_path / "set").names

@@ -15,6 +15,7 @@ from scipy.stats import hypergeom
 
 from adaptfault.cli import main
 from adaptfault.data.recordings import Recordings, save_npz
+from adaptfault.data.recordings.facts.rates import Clock
 from adaptfault.data.simulated_grasps import simulate
 from adaptfault.inspection.quick import quick, quick_check
 from adaptfault.inspection.quick_statistics import Statistics
@@ -63,7 +64,7 @@ def test_of_a_healthy_set_nothing_is_told_but_what_was_not_checked(grasps):
     statistics = Statistics.of(log)
     found = quick(statistics)
     assert (found.inspection.findings, found.answers.mean() > 0.8) == ((), True)
-    checked = quick_check(statistics, found, log)
+    checked = quick_check(statistics, found, Clock())
     assert checked.to_dict()["level"] == "quick"
     assert "was not tested" in checked.findings.unchecked[0].what
     assert checked.badge().count("not tested")
@@ -155,21 +156,35 @@ def stored(grasps, tmp_path):
     return tmp_path / "set.npz"
 
 
-@settings(max_examples=10, deadline=None)
-@given(cuts=st.sets(st.integers(1, 35), max_size=6))
-def test_the_verdict_of_merged_parts_is_that_of_the_whole(cuts, grasps):
+def joined(parts: list[Statistics], draw) -> Statistics:
+    """Join parts that lie side by side, two or more at a time, in any order."""
+    while len(parts) > 1:
+        first = draw(st.integers(0, len(parts) - 2))
+        last = draw(st.integers(first + 2, len(parts)))
+        parts = [*parts[:first], Statistics.joined(parts[first:last]), *parts[last:]]
+    return parts[0]
+
+
+@settings(max_examples=15, deadline=None)
+@given(data=st.data())
+def test_the_verdict_of_merged_parts_is_that_of_the_whole_however_they_are_cut_and_joined(
+    data, grasps
+):
     log = changed(grasps, slice(14, 20), MIDDLE, lambda n: np.full(n, 1.1))
+    log[1] = log[1][25:]  # begins in contact
+    log[9][3:6, 4] = np.nan
     names = tuple(f"recording {i}" for i in range(len(log)))
     whole = Statistics.of(Recordings(tuple(log), LAYOUT, names=names))
-    ends = [0, *sorted(cut for cut in cuts if cut < len(log)), len(log)]
+    cuts = data.draw(st.sets(st.integers(1, len(log) - 1), max_size=6))
     parts = [
         Statistics.of(Recordings(tuple(log[a:b]), LAYOUT, names=names[a:b]))
-        for a, b in pairwise(ends)
+        for a, b in pairwise([0, *sorted(cuts), len(log)])
     ]
-    merged = Statistics.joined(parts)
-    assert quick(whole).inspection.diagnosis.fault_set == {MIDDLE}
-    assert quick(merged).inspection.to_dict() == quick(whole).inspection.to_dict()
-    assert merged.summary.to_dict() == whole.summary.to_dict()
+    merged = joined(parts, data.draw)
+    expected = quick_check(whole, quick(whole), None)
+    assert "recording 1" in expected.begin_in_contact
+    assert set(expected.inspection.diagnosis.fault_set) == {MIDDLE}
+    assert quick_check(merged, quick(merged), None).to_dict() == expected.to_dict()
 
 
 def test_parts_that_are_written_and_merged_say_what_the_whole_says(stored, tmp_path, capsys):
@@ -182,9 +197,37 @@ def test_parts_that_are_written_and_merged_say_what_the_whole_says(stored, tmp_p
     assert main(["check", "--merge", *parts, "--json"]) == 1
     merged = json.loads(capsys.readouterr().out)
     jsonschema.validate(merged, schema_of(merged["schema"]))
-    assert merged["inspection"] == whole["inspection"]
+    for name in ("inspection", "findings", "begin_in_contact", "tared_in_contact", "leave_out"):
+        assert merged[name] == whole[name]
     left = [one["what"] for one in merged["not_checked"]]
     assert any("parts that are merged do not hold them" in what for what in left)
+
+
+def test_a_shard_reads_its_own_recordings_and_all_together_tell_what_the_whole_tells(
+    grasps, tmp_path, capsys
+):
+    for i, one in enumerate(grasps[:16]):
+        folder = tmp_path / "set" / ("pick" if i < 8 else "place")
+        folder.mkdir(parents=True, exist_ok=True)
+        np.savetxt(folder / f"{i:02d}.csv", one, delimiter=",", fmt="%.4f")
+    (tmp_path / "set/pick/broken.csv").write_text("1,2\nx\n")  # cannot be read
+    (tmp_path / "set/place/broken.npz").write_bytes(b"PK")  # nor listed
+    given = [str(tmp_path / "set"), "--shape", "6x6", "--full-scale", "3.3", "--rate", "20"]
+    main(["check", *given, "--quick", "--json"])
+    captured = capsys.readouterr()
+    whole = json.loads(captured.out)
+    assert whole["left_out"] == 2
+    parts = [str(tmp_path / f"{i}.part") for i in (1, 2, 3)]
+    told = []
+    for i, part in enumerate(parts, 1):
+        main(["check", *given, "--shard", f"{i}/3", "--out", part])
+        told.append("broken.csv" in capsys.readouterr().err)
+    assert sum(told) == 1  # the others never look at it
+    main(["check", "--merge", *parts, "--json"])
+    merged = json.loads(capsys.readouterr().out)
+    assert whole["summary"]["classes"] == {"pick": 8, "place": 8}
+    for name in ("findings", "summary", "left_out", "begin_in_contact"):
+        assert merged[name] == whole[name]
 
 
 def test_what_is_no_part_or_of_another_array_is_refused(stored, tmp_path, capsys):

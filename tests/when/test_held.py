@@ -124,6 +124,34 @@ def test_cells_that_hold_a_value_through_one_task_are_found_where_loads_last(see
     assert not np.delete(suspect, cells, axis=1).any()
 
 
+@pytest.mark.parametrize("seed", [0, 3, 4])
+def test_a_row_that_is_dead_in_the_middle_of_few_recordings_does_not_hide_itself(seed):
+    layout = SensorLayout(1, 12, 10, full_scale=3.3, rate=20.0)
+    row = list(range(60, 70))
+    made = simulate(12, layout, n_frames=60, seed=seed, classes=("nothing", "normal"))
+    order = np.argsort(np.arange(len(made.frames)) % 12, kind="stable")  # in turn
+    log = [np.asarray(made.frames[i], np.float64) for i in order]
+
+    def suspects(log: list[np.ndarray]) -> list[int]:
+        spans = Spans.of(RecordingBlocks(log))
+        held = find_held(spans, layout, 0.0165, made.labels[order])
+        return np.flatnonzero(held.suspect.any(axis=0)).tolist()
+
+    assert suspects(log) == []
+    assert suspects(broken(log, row, set(range(8, 16)))) == row
+
+
+def test_a_cell_that_dies_among_cells_that_always_move_is_found():
+    layout = SensorLayout(1, 3, 4, full_scale=1.0)
+    rng = np.random.default_rng(0)
+    course = np.sin(np.linspace(0, np.pi, 60))[:, None]
+    log = [0.1 + course * rng.uniform(0.2, 0.8, 12) for _ in range(40)]
+    for one in log[20:]:
+        one[:, 7] = 0.1
+    suspect = find_held(Spans.of(RecordingBlocks(log)), layout, 0.005).suspect
+    assert np.argwhere(suspect).tolist() == [[i, 7] for i in range(20, 40)]
+
+
 def test_few_recordings_say_nothing(grasps):
     assert not found(broken(grasps[:10], ROW, set(range(5)))).any()
 

@@ -93,7 +93,7 @@ def check_readings(
 def _disorder(content: Content, i: int, elapsed: Elapsed) -> list[Problem]:
     """Warn of frames in the wrong order, and of a clock that falls back."""
     found = []
-    if disorder := elapsed.clock().disorder:
+    if disorder := elapsed.disorder:
         where = content.where(i, elapsed.first_late)
         found.append(f"{disorder}, the first in {where}: kept as they stand")
     if elapsed.falls:

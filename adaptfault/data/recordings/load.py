@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from copy import copy
 from dataclasses import dataclass, replace
 from itertools import groupby
 from operator import itemgetter
@@ -45,7 +44,7 @@ from adaptfault.data.recordings.facts.resolve import (
 from adaptfault.data.recordings.facts.targets import TargetTable, target_files
 from adaptfault.data.recordings.files import Found, find, passed_over
 from adaptfault.data.recordings.readers import check_stated, readers
-from adaptfault.data.recordings.recording import BLOCK, Shape
+from adaptfault.data.recordings.recording import BLOCK, Recording, Shape
 from adaptfault.data.recordings.survey import Content, Surveyor
 from diagnostics import SensorLayout
 from diagnostics.shown import shown
@@ -54,6 +53,9 @@ if TYPE_CHECKING:
     from adaptfault.data.calibration import Calibration
 
 PathName = str | PathLike[str]
+
+Listed = tuple[Found, list[Recording]]
+"""A file, and the recordings in it."""
 
 ROOM = 256_000_000
 """Bytes of frames that :func:`open_recordings` keeps, so that small files are read once."""
@@ -102,6 +104,7 @@ class Opened:
         inferred: as in :class:`Loaded`.
         problems: errors and warnings.
         origins: the recordings as their readers give them: which arrays of a data set hold them.
+        n_found: number of all recordings, of which these were selected.
         late_problems: warnings about the range of readings, after a whole iteration.
     """
 
@@ -113,11 +116,16 @@ class Opened:
         tables: Calibration | None,
         problems: list[Problem],
         values: TargetTable | None,
+        n_found: int | None = None,
     ) -> None:
         self._tables = tables
         self.layout = layout
         self.inferred = inferred
-        self._take([(content, i) for content in contents for i in content.kept])
+        self._each = [(content, i) for content in contents for i in content.kept]
+        self._surveys = [content.surveys[i] for content, i in self._each]
+        self.origins = tuple(content.recordings[i] for content, i in self._each)
+        self.names = tuple(content.name(i) for content, i in self._each)
+        self.lengths = tuple(survey.length for survey in self._surveys)
         labels = [content.labels[i] if content.labels else None for content, i in self._each]
         orders = [content.facts.class_names for content in contents]
         self.labels, self.class_names = class_indices(labels, orders, problems)
@@ -128,25 +136,7 @@ class Opened:
             self.targets = tuple(one.targets for one, _ in self._each if one.targets is not None)
         self.problems = tuple(problems)
         self.late_problems: tuple[Problem, ...] = ()
-
-    def _take(self, each: list[tuple[Content, int]]) -> None:
-        """Hold recordings, each by its file and its number there."""
-        self._each = each
-        self._surveys = [content.surveys[i] for content, i in each]
-        self.origins = tuple(content.recordings[i] for content, i in each)
-        self.names = tuple(content.name(i) for content, i in each)
-        self.lengths = tuple(survey.length for survey in self._surveys)
-
-    def select(self, which: Iterable[int]) -> Opened:
-        """Return the recordings with these numbers, in their order."""
-        order = sorted(set(which))
-        part = copy(self)
-        part._take([self._each[i] for i in order])
-        if self.labels is not None:
-            part.labels = self.labels[order]
-        if self.targets is not None:
-            part.targets = tuple(self.targets[i] for i in order)
-        return part
+        self.n_found = len(self) if n_found is None else n_found
 
     @property
     def clock(self) -> Clock:
@@ -316,12 +306,15 @@ def open_recordings(
     targets: PathName | None = None,
     room: int | None = ROOM,
     progress: Callable[[int], None] = _nothing,
+    select: Callable[[int], Iterable[int]] | None = None,
     **stated: Any,
 ) -> Opened:
     """Return recordings of any size; their frames are read when they are asked for.
 
     Args:
         room: bytes of frames that are kept in memory; None: all.
+        select: returns the numbers, from 0, of those recordings whose frames are read, of how many
+            there are; None: all.
         progress: receives the number of frames of each block of the first reading.
         paths, stated, layout and the other options: as for :func:`load`.
 
@@ -340,11 +333,20 @@ def open_recordings(
     aside = {Path(p).resolve() for p in tables_given if isinstance(p, str | PathLike)}
     found, problems = find(given, readers(), aside)
     surveyor = Surveyor(PAPER.full_scale * SLACK, 2**62 if room is None else room, progress)
-    contents = _surveyed(found, _asked(stated, array), surveyor, problems)
+    listed: Iterable[Listed] = _listed(found, _asked(stated, array), problems)
+    unread: list[Found] = []
+    n_found = None
+    if select is not None:
+        every = list(listed)
+        n_found = sum(len(recordings) for _, recordings in every)
+        listed = _selected(every, select(n_found))
+        unread = _without_labels(every, [file for file, _ in listed])
+    contents = _surveyed(listed, surveyor, problems)
     if values is not None:
         contents = target_files(contents, values, problems)
     else:
-        contents = label_files(contents, None if labels is None else Path(labels), problems)
+        table = None if labels is None else Path(labels)
+        contents = label_files(contents, table, problems, unread)
     if not contents:
         raise nothing_left(problems)
     options = {"full_scale": full_scale, "unit": unit, "rate": rate}
@@ -360,7 +362,7 @@ def open_recordings(
             check_statements(content, known, tables is not None)
 
     usable = _usable(contents, known, check, frames, problems)
-    return Opened(usable, known, inferred, tables, problems, values)
+    return Opened(usable, known, inferred, tables, problems, values, n_found)
 
 
 def _check_options(
@@ -387,23 +389,65 @@ def _asked(stated: Mapping[str, Any], array: SensorLayout | Shape | None) -> dic
 
 
 def _surveyed(
-    found: Sequence[Found], asked: Mapping[str, Any], surveyor: Surveyor, problems: list[Problem]
+    listed: Iterable[Listed], surveyor: Surveyor, problems: list[Problem]
 ) -> list[Content]:
     """Return the contents of files; what cannot be read is told, and the others are read."""
     contents = []
+    for file, recordings in listed:
+        try:
+            with foreseeing(file.path):
+                contents.append(surveyor(file, recordings, problems))
+        except InputError as error:
+            problems.append(Problem("error", str(error)))
+    return contents
+
+
+def _listed(
+    found: Sequence[Found], asked: Mapping[str, Any], problems: list[Problem]
+) -> Iterator[Listed]:
+    """Yield the recordings of each file, none of whose frames is read yet; what cannot be read is
+    told."""
     notes: list[Path] = []
     for file in found:
         try:
             with foreseeing(file.path):
                 recordings = list(file.reader.open(file.path, **asked))
-                if recordings:
-                    contents.append(surveyor(file, recordings, problems))
-                else:
-                    notes.append(file.path)
         except InputError as error:
             problems.append(Problem("error", str(error)))
+            continue
+        if recordings:
+            yield file, recordings
+        else:
+            notes.append(file.path)
     problems += passed_over(notes)
-    return contents
+
+
+def _selected(listed: Sequence[Listed], numbers: Iterable[int]) -> list[Listed]:
+    """Return the recordings with these numbers, which keep their names, and their files."""
+    chosen = set(numbers)
+    number = iter(range(sum(len(recordings) for _, recordings in listed)))
+    selected = []
+    for file, recordings in listed:
+        kept = [one for one in _named(file, recordings) if next(number) in chosen]
+        if kept:
+            selected.append((file, kept))
+    return selected
+
+
+def _named(file: Found, recordings: Sequence[Recording]) -> list[Recording]:
+    """Return the recordings of a file, which all have a name where they are several."""
+    if len(recordings) < 2:
+        return list(recordings)
+    return [
+        replace(one, name=one.name or f"{file.name}, recording {i}")
+        for i, one in enumerate(recordings)
+    ]
+
+
+def _without_labels(listed: Sequence[Listed], read: Sequence[Found]) -> list[Found]:
+    """Return the files that are not ``read``, and state no label of a recording."""
+    others = [(file, recordings) for file, recordings in listed if file not in read]
+    return [file for file, recordings in others if any(one.label is None for one in recordings)]
 
 
 def _usable(

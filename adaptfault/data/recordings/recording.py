@@ -46,6 +46,13 @@ class Block:
     problems: tuple[Problem, ...] = ()
 
 
+def device_name(stated: object) -> str | None:
+    """Return how a device is called, from what a file states; None where that is no name."""
+    if isinstance(stated, bool) or not isinstance(stated, str | int):
+        return None
+    return printable(str(stated).strip())[:_LONGEST_NAME].replace("\n", " ") or None
+
+
 @dataclass(frozen=True, eq=False)
 class Facts:
     """What a file states about the array; None = it does not.
@@ -94,10 +101,7 @@ class Facts:
     @property
     def device(self) -> str | None:
         """Which specimen it is, as a name of its own or a number."""
-        stated = self.declared.get("device")
-        if isinstance(stated, bool) or not isinstance(stated, str | int):
-            return None
-        return printable(str(stated).strip())[:_LONGEST_NAME].replace("\n", " ") or None
+        return device_name(self.declared.get("device"))
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,6 +116,7 @@ class Recording:
         arrays: of the file that hold its readings.
         number: how the file numbers it; None: it does not.
         row: how a table numbers its first row; None: the file is no table.
+        device: which specimen recorded it, as a name of its own or a number.
     """
 
     facts: Facts
@@ -121,6 +126,7 @@ class Recording:
     arrays: tuple[str, ...] = ()
     number: int | None = None
     row: int | None = None
+    device: str | None = None
 
     @property
     def frames(self) -> NDArray[Any]:

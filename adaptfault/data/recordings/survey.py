@@ -19,6 +19,7 @@ from adaptfault.data.recordings.files import Found
 from adaptfault.data.recordings.recording import Block, Facts, Recording, Shape
 from diagnostics import SensorLayout
 from diagnostics.preprocessing.levels import LOW
+from diagnostics.preprocessing.quantiles import known_quantile
 from diagnostics.sensor.odd_frames import find_odd_frames
 
 _FEW = 8  # frames, that tell no corrupt one from the others
@@ -129,7 +130,7 @@ def _measured(values: NDArray[Any]) -> NDArray[Any]:
     if len(values) < _FEW or not values.shape[1]:
         return values
     highest = np.nan_to_num(np.fmax.reduce(values, axis=1), posinf=0.0)
-    if not highest.max() > _FAR * np.quantile(highest, 1 - 2 * LOW):
+    if not highest.max() > _FAR * known_quantile(highest, 1 - 2 * LOW, axis=0):
         return values
     odd = find_odd_frames([values], SensorLayout(1, 1, values.shape[1]))
     return np.delete(values, [one.frame for one in odd if one.kind == "corrupt"], axis=0)

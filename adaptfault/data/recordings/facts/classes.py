@@ -12,20 +12,27 @@ from numpy.typing import NDArray
 
 from adaptfault.data.recordings.errors import Problem
 from adaptfault.data.recordings.facts.labels import natural_order, read_label_table
+from adaptfault.data.recordings.files import Found
 from adaptfault.data.recordings.survey import Content
 
 
 def label_files(
-    contents: Sequence[Content], table: Path | None, problems: list[Problem]
+    contents: Sequence[Content],
+    table: Path | None,
+    problems: list[Problem],
+    beside: Sequence[Found] = (),
 ) -> list[Content]:
     """Label the files that carry no labels, by table or folder; a file without one among others is
-    left out."""
+    left out.
+
+    ``beside``: other files without labels, of which nothing is read.
+    """
     known: dict[Path, dict[Path, str]] = {}
     listings = {table or content.file.table for content in contents}
     for path in sorted(path for path in listings if path is not None):
         known[path], wrong = read_label_table(path)
         problems += wrong
-    files = [content.file for content in contents if content.labels is None]
+    files = [*beside, *(content.file for content in contents if content.labels is None)]
     bare = [file for file in files if not (table or file.table)]
     nested = {file.root for file in bare if not file.is_direct}
     many = bool(nested) or len({file.path.parent.resolve() for file in bare}) > 1

@@ -13,11 +13,6 @@ from typing import Any
 
 import numpy as np
 
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
-
 from adaptfault.data.atomic import atomic_write
 from adaptfault.data.printable import printable
 from adaptfault.data.recordings.errors import InputError
@@ -180,6 +175,10 @@ def _document(path: Path) -> dict[str, Any]:
 
 
 def _read_toml(path: Path) -> dict[str, Any]:
+    if sys.version_info >= (3, 11):  # slow to import, and rarely needed
+        import tomllib
+    else:
+        import tomli as tomllib
     try:
         return tomllib.loads(read_text(path))
     except tomllib.TOMLDecodeError as error:

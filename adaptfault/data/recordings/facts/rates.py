@@ -16,7 +16,7 @@ where the times jitter by more than a fifth of the period.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -181,14 +181,25 @@ class Elapsed:
                 shared.append(np.diff(begins)[usable].astype(np.float64))
         return np.concatenate(steps), np.concatenate(shared)
 
-    def clock(self) -> Clock:
-        """Return how regular the times are."""
-        steps, shared = self._pooled()
+    @property
+    def disorder(self) -> str:
+        """A sentence on frames in the wrong order; "" where there are none."""
+        return self._disorder.disorder
+
+    @property
+    def _disorder(self) -> Clock:
+        """What the order of the times tells of the clock."""
         orders = [part._ordered() for part in self._parts]
         late = sum(order.late for order in orders)
         pairs = all(order.pairs for order in orders if order.late)
+        return Clock(None, 0, self.falls, late, pairs)
+
+    def clock(self) -> Clock:
+        """Return how regular the times are."""
+        steps, shared = self._pooled()
+        order = self._disorder
         if not len(steps):
-            return Clock(None, 0, self.falls, late, pairs)
+            return order
         with np.errstate(all="ignore"):  # a time may be anything that a file can hold
             periods = steps / shared
             period = float(np.median(periods))
@@ -197,7 +208,7 @@ class Elapsed:
             whole = np.maximum(1, np.rint(multiples))
             regular = np.mean(np.abs(multiples - whole) < _NEAR) >= _MOST
         lost = int((whole - 1).sum()) if regular else 0
-        return Clock(jitter if np.isfinite(jitter) else None, lost, self.falls, late, pairs)
+        return replace(order, jitter=jitter if np.isfinite(jitter) else None, lost=lost)
 
     def _per_tick(self) -> float | None:
         """Return frames a tick."""

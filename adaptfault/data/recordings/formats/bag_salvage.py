@@ -4,14 +4,16 @@ it."""
 from __future__ import annotations
 
 import io
-import sqlite3
 import struct
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from adaptfault.data.recordings.formats.bag_fields import Found, Topic
+
+if TYPE_CHECKING:
+    import sqlite3
 
 _MOST = 1 << 30  # bytes of one record or chunk; more is damage, and would fill the memory
 _CHUNK = 0x06  # MCAP's opcode
@@ -70,6 +72,8 @@ class Salvage:
                     return
 
     def _sqlite(self) -> Iterator[Found]:
+        import sqlite3  # slow to import, and rarely needed
+
         try:
             with closing(
                 sqlite3.connect(f"{self.path.resolve().as_uri()}?immutable=1", uri=True)

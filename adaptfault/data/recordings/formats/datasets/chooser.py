@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adaptfault.data.recordings.errors import InputError, Problem
-from adaptfault.data.recordings.facts.episodes import Division, Episode, numbered
+from adaptfault.data.recordings.facts.episodes import Division, Episode
 from adaptfault.data.recordings.facts.labels import natural_key
 from adaptfault.data.recordings.facts.roles import (
     COUNTERS,
@@ -51,6 +51,7 @@ from adaptfault.data.recordings.formats.datasets.beside import (
     plain_number,
 )
 from adaptfault.data.recordings.formats.datasets.contents import (
+    DEVICES,
     FULL_SCALES,
     NUMBERS,
     RATES,
@@ -69,7 +70,7 @@ from adaptfault.data.recordings.formats.datasets.features import (
     is_touch,
 )
 from adaptfault.data.recordings.formats.datasets.parts import Part, Readings
-from adaptfault.data.recordings.recording import Facts, Shape
+from adaptfault.data.recordings.recording import Facts, Shape, device_name
 
 _OUTER = ("frames", "recordings")  # names of arrays [n, T, ...]
 _ENDS = ("episode_ends", "lengths", "episode_lengths")
@@ -102,7 +103,7 @@ class Chooser:
         self.outer = False
         self.is_turned = False
         self.is_doubted = False
-        aside = (*EPISODES, *LABELS, *given_names(stated))
+        aside = (*EPISODES, *LABELS, *DEVICES, *given_names(stated))
         self._beside: dict[str, list[str]] = {}
         for name in arrays:
             if last_part(name) in aside or is_clock(last_part(name)):
@@ -165,7 +166,7 @@ class Chooser:
         if array.dtype.kind not in NUMBERS or name == self.ends:
             return False
         if len(array.shape) == 1:
-            aside = (*EPISODES, *COUNTERS, "index", *LABELS, *given_names(self.stated))
+            aside = (*EPISODES, *COUNTERS, "index", *LABELS, *DEVICES, *given_names(self.stated))
             return last not in aside and not is_clock(last)
         return last not in given_names(self.stated)
 
@@ -217,6 +218,17 @@ class Chooser:
         is_one = len(sizes) == 4 and sizes[1] == 1  # [T, 1, rows, columns]
         return len(sizes) == 5 or (last_part(names[0]) in _OUTER and not is_one)
 
+    def device(self, part: Part) -> str | None:
+        """Return which specimen recorded a recording: what an attribute of its arrays or groups
+        says, or a column in its first row; None where nothing does."""
+        name = part.names[0]
+        stated = self.contents.declared(name).get("device")
+        column = self._near(name, DEVICES, self._length(name))
+        if stated is None and column is not None and part.last > part.first:
+            first = np.asarray(self.contents.arrays[column][part.first : part.first + 1])
+            (stated,) = texts(first)
+        return device_name(stated)
+
     def row(self, part: Part) -> int | None:
         """Return what a table calls the first row of a recording: its column ``index``, or its
         place; None where the file is no table."""
@@ -238,7 +250,14 @@ class Chooser:
         if part.clock is not None:
             units = self.contents.attributes.get(part.clock, {}).get("units")
             tick = unit_of(part.clock, units)
-        return Readings(part, tuple(packings), self.is_turned, tick)
+        masks = tuple(name for name in part.names if self._has_mask(name))
+        return Readings(part, tuple(packings), masks, self.is_turned, tick)
+
+    def _has_mask(self, name: str) -> bool:
+        """Return whether the file says which readings of an array are valid; a mask of another
+        shape is none."""
+        mask = self.contents.valid.get(name)
+        return mask is not None and tuple(mask.shape) == tuple(self.contents.arrays[name].shape)
 
     def _packing(self, name: str) -> Packing:
         try:
@@ -382,7 +401,9 @@ class Chooser:
             stored = np.array(texts(stored))
         if stored.dtype.kind == "f" and not np.isfinite(stored).all():
             raise InputError.at(self.path, f"rows without {name}; leave them out")
-        return numbered([plain_number(value) for value in stored]) if len(stored) else []
+        changes = np.flatnonzero(stored[1:] != stored[:-1]) + 1
+        ends = [0, *changes.tolist(), len(stored)] if len(stored) else []
+        return [Episode(first, last, plain_number(stored[first])) for first, last in pairwise(ends)]
 
     def _near(self, name: str, wanted: Sequence[str], length: int | None = None) -> str | None:
         """Return an array in the group of ``name``, or above it: the first of the names that are

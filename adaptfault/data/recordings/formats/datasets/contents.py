@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adaptfault.data.recordings.facts.roles import LABELS
-from adaptfault.data.recordings.formats.datasets.features import is_touch
+from adaptfault.data.recordings.formats.datasets.features import VALID, is_touch
 
 NUMBERS = "iuf"
 TIMES = "mM"
@@ -59,6 +59,7 @@ class Contents:
 
     Attributes:
         arrays: of numbers, times and texts, by their names with groups, as "data/tactile".
+        valid: which readings of an array are valid, by its name: what ``check --write-copy`` wrote.
         attributes: of each group and array that has some; "" is the file itself.
         left_out: arrays that cannot be read, and why.
         told: other warnings.
@@ -66,6 +67,7 @@ class Contents:
     """
 
     arrays: dict[str, Array] = field(default_factory=dict)
+    valid: dict[str, Array] = field(default_factory=dict)
     attributes: dict[str, dict[str, Any]] = field(default_factory=dict)
     left_out: dict[str, str] = field(default_factory=dict)
     told: list[str] = field(default_factory=list)
@@ -73,11 +75,14 @@ class Contents:
 
     def add(self, name: str, array: Array, attributes: Mapping[str, Any] | None = None) -> None:
         """Take in an array: one value under a name of :data:`RATES` and the like is an attribute of
-        its group, and what holds neither numbers, times nor texts is left out."""
+        its group, a mask belongs to its array, and what holds neither numbers, times nor texts is
+        left out."""
         group, _, last = name.rpartition("/")
         size = math.prod(array.shape)
         kind = array.dtype.kind
-        if kind == "c":
+        if kind == "b" and name.endswith(VALID):
+            self.valid[name.removesuffix(VALID)] = array
+        elif kind == "c":
             self.left_out[name] = "holds complex numbers; save their real part or their amplitude"
         elif size == 1 and last.lower() in _SCALARS:
             value = np.asarray(array[:] if array.shape else array).ravel()[0]

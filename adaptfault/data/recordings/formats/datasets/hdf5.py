@@ -49,7 +49,8 @@ def opened(path: Path, names: Sequence[str] | None = None) -> Iterator[Contents]
     with file:
         contents = Contents()
         if names is not None:
-            contents.arrays.update({name: _array(_found(file, name)) for name in names})
+            for name in names:
+                contents.add(name, _array(_found(file, name)))
         else:
             with foreseeing(path, "is damaged ({}); copy it again"):
                 contents.attributes[""] = dict(file.attrs)

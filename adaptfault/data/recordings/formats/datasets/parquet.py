@@ -10,6 +10,7 @@ import builtins
 import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -37,9 +38,21 @@ _NUMBERS = {"halffloat": "float16", "float": "float32", "double": "float64"}
 def opened(path: Path, names: Sequence[str] | None = None) -> Iterator[Contents]:
     """Open a file; ``names``: of the columns that are wanted, None: all it holds.
 
+    What the last files hold stays known, as each of their episodes asks for it; it is read anew
+    where all is asked for, as the file may have changed since.
+
     Raises:
         InputError: pyarrow is not installed, or the file is damaged.
     """
+    if names is None:
+        _contents.cache_clear()
+    held = _contents(path, None if names is None else tuple(names))
+    yield replace(held, attributes=dict(held.attributes))
+
+
+@lru_cache(maxsize=2)
+def _contents(path: Path, names: tuple[str, ...] | None) -> Contents:
+    """Return what a file holds; arguments and errors as for :func:`opened`."""
     parquet = imported("pyarrow.parquet", path)
     contents = Contents(is_table=True)
     check_kind(path)
@@ -49,7 +62,7 @@ def opened(path: Path, names: Sequence[str] | None = None) -> Iterator[Contents]
         groups = tuple(about.row_group(i).num_rows for i in range(about.num_row_groups))
         columns = held.schema_arrow
         every = columns.names
-        wanted = tuple(every) if names is None else tuple(names)
+        wanted = tuple(every) if names is None else names
         for field in columns:
             if field.name not in wanted:
                 continue
@@ -62,7 +75,7 @@ def opened(path: Path, names: Sequence[str] | None = None) -> Iterator[Contents]
                     contents.left_out[field.name] = f"is {field.type}, no column of numbers"
             else:
                 _add(contents, field.name, column, path.stat().st_size)
-    yield contents
+    return contents
 
 
 open = reader(opened)
@@ -133,7 +146,7 @@ class _Column:
             high = min(last - begin, rows)
             if low < high:
                 table = _group(self.path, group, self.beside)
-                column = table.column(self.name).combine_chunks().slice(low, high - low)
+                column = table.column(self.name).slice(low, high - low).combine_chunks()
                 pieces.append(_array(self.path, column, self, begin + low))
             begin += rows
         return np.concatenate(pieces[1:] or pieces)
@@ -173,8 +186,8 @@ def _tensor(kind: Any) -> list[int]:
 
 
 def _dtype(path: Path, kind: Any) -> np.dtype[Any] | None:
-    """Return numpy's type for the values of a column; None where they are no numbers, times or
-    texts."""
+    """Return numpy's type for the values of a column; None where they are no numbers, truth values,
+    times or texts."""
     types = imported("pyarrow.types", path)
     if types.is_integer(kind) or types.is_floating(kind):
         number: np.dtype[Any] = np.dtype(_NUMBERS.get(str(kind), str(kind)))
@@ -185,6 +198,8 @@ def _dtype(path: Path, kind: Any) -> np.dtype[Any] | None:
         return np.dtype("datetime64[ns]")
     if types.is_duration(kind):
         return np.dtype("timedelta64[ns]")
+    if types.is_boolean(kind):
+        return np.dtype(np.bool_)
     is_text = types.is_string(kind) or types.is_large_string(kind) or types.is_string_view(kind)
     return np.dtype(object) if is_text else None
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,11 +16,12 @@ from adaptfault.data.recordings.formats.datasets.axes import TimeLast, Vector
 from adaptfault.data.recordings.formats.datasets.contents import (
     TEXTS,
     TIMES,
+    Array,
     Opened,
     Packing,
     texts,
 )
-from adaptfault.data.recordings.formats.datasets.features import Pads, Sizes, shown
+from adaptfault.data.recordings.formats.datasets.features import VALID, Pads, Sizes, shown
 from adaptfault.data.recordings.recording import BLOCK, Block
 
 _ROOM = 64 << 20  # bytes of readings that are read at once
@@ -64,12 +65,14 @@ class Readings:
     Attributes:
         part: where its frames are.
         packings: of its arrays.
+        masks: of those arrays that say which of their readings are valid.
         turned: whether the time is their last axis.
         tick: unit of its times.
     """
 
     part: Part
     packings: tuple[Packing, ...]
+    masks: tuple[str, ...]
     turned: bool
     tick: str | None
 
@@ -93,25 +96,44 @@ def blocks(path: Path, opened: Opened, held: Readings, pads: Pads) -> Iterator[B
     part = held.part
     # times of rows are none of frames
     clock = part.clock if pads.steps == 1 else None
-    wanted = [*part.names, *([] if clock is None else [clock])]
+    wanted = [*part.names, *(f"{name}{VALID}" for name in held.masks)]
+    wanted += [] if clock is None else [clock]
     with opened(wanted) as contents:
-        arrays: list[Any] = [contents.arrays[name] for name in part.names]
-        if held.turned:
-            arrays = [TimeLast(array) for array in arrays]
-        if part.outer is not None:
-            arrays = [arrays[0][part.outer : part.outer + 1][0]]
+        arrays = _arrays(held, contents.arrays, part.names)
+        valid = dict(zip(held.masks, _arrays(held, contents.valid, held.masks), strict=True))
+        masks = [valid.get(name) for name in part.names]
         times = None if clock is None else Vector(contents.arrays[clock])
         for first, last in _pieces(part, arrays, pads):
             where = f"{part.name or part.names[0]}, frames {first} to {last - 1}"
             damaged = "cannot be read ({}): damaged, or cut off; copy it again"
             with foreseeing(path, damaged, where):
                 values = [np.array(array[first:last]) for array in arrays]
+                checked = [None if mask is None else np.array(mask[first:last]) for mask in masks]
                 stamps = None if times is None else np.asarray(times[first:last])
             if any(len(value) != last - first for value in values):
                 raise InputError.at(path, "is cut off; copy it again", where)
             packed = zip(held.packings, values, strict=True)
-            frames = pads.frames([packing.unpacked(value) for packing, value in packed])
+            readings = [packing.unpacked(value) for packing, value in packed]
+            frames = pads.frames(list(map(_valid, readings, checked)))
             yield _block(path, frames, stamps, held)
+
+
+def _arrays(held: Readings, arrays: Mapping[str, Array], names: Sequence[str]) -> list[Any]:
+    """Return arrays of one recording, whose first axis is the time."""
+    found: list[Any] = [arrays[name] for name in names]
+    if held.turned:
+        found = [TimeLast(array) for array in found]
+    if held.part.outer is not None:
+        outer = held.part.outer
+        found = [array[outer : outer + 1][0] for array in found]
+    return found
+
+
+def _valid(readings: NDArray[Any], mask: NDArray[np.bool_] | None) -> NDArray[Any]:
+    """Return readings of which those that are not valid are missing."""
+    if mask is None or mask.all():
+        return readings
+    return np.where(mask, readings, np.nan)
 
 
 def _pieces(part: Part, arrays: Sequence[Any], pads: Pads) -> Iterator[tuple[int, int]]:

@@ -92,5 +92,6 @@ def recordings_of(
             name = None if part.name is None else f"{path.name}, {part.name}"
             number = part.number if isinstance(part.number, int) else None
             row = chooser.row(part)
-            found.append(Recording(facts, read, name, part.label, part.names, number, row))
+            device = chooser.device(part)
+            found.append(Recording(facts, read, name, part.label, part.names, number, row, device))
     return found

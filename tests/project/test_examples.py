@@ -39,6 +39,7 @@ LESS = {  # they take minutes
     "force.py": ["--grasps", "8", "--epochs", "1"],
     "fine_tuning.py": ["--small"],
     "forecast_intervals.py": ["--small"],
+    "read_out_bench.py": ["--small"],
     "restore_speed.py": ["--grasps", "1", "--repeats", "5"],
     "ros_latency.py": ["--seconds", "1", "--rates", "100"],
     "soak.py": ["--hours", "12", "--frames", "500"],

@@ -52,6 +52,7 @@ from diagnostics.shown import shown
 
 if TYPE_CHECKING:
     from adaptfault.data.calibration import Calibration
+    from diagnostics import Scan
 
 PathName = str | PathLike[str]
 
@@ -103,6 +104,7 @@ class Opened:
         problems: errors and warnings.
         origins: the recordings as their readers give them: which arrays of a data set hold them.
         late_problems: warnings about the range of readings, after a whole iteration.
+        scan: of the read-out, of all files; None: there is none.
     """
 
     def __init__(
@@ -113,7 +115,9 @@ class Opened:
         tables: Calibration | None,
         problems: list[Problem],
         values: TargetTable | None,
+        scan: Scan | None = None,
     ) -> None:
+        self.scan = scan
         self._tables = tables
         self.layout = layout
         self.inferred = inferred
@@ -294,6 +298,7 @@ def load(paths: PathName | Iterable[PathName], *, strict: bool = False, **option
         opened.names,
         opened.targets,
         opened.value_names,
+        opened.scan,
     )
     scale = check_scale(given[0], recordings, opened.layout) if strict else []
     told = copies(recordings.frames, recordings.names)
@@ -360,7 +365,8 @@ def open_recordings(
             check_statements(content, known, tables is not None)
 
     usable = _usable(contents, known, check, frames, problems)
-    return Opened(usable, known, inferred, tables, problems, values)
+    scan = surveyor.scans.of(known, problems)
+    return Opened(usable, known, inferred, tables, problems, values, scan)
 
 
 def _check_options(
@@ -396,10 +402,12 @@ def _surveyed(
         try:
             with foreseeing(file.path):
                 recordings = list(file.reader.open(file.path, **asked))
-                if recordings:
-                    contents.append(surveyor(file, recordings, problems))
-                else:
+                if not recordings:
                     notes.append(file.path)
+                    continue
+                content = surveyor(file, recordings, problems)
+                if content is not None:
+                    contents.append(content)
         except InputError as error:
             problems.append(Problem("error", str(error)))
     problems += passed_over(notes)

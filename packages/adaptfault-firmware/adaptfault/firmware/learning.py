@@ -7,8 +7,8 @@ its witnesses moved in at most while it did not:
     confidence(j tells of i) = (pieces in which both move + a p) / (pieces in which j moves + a)
     stuck_after              = MARGIN x most frames + LEAST
 
-with pieces of 8 frames, p the share of the pieces in which i moves, and a = 8. Of the four
-witnesses of a cell two at most share a wire with it.
+with pieces of 8 frames, p the share of the pieces in which i moves, and a = 8. No two of the four
+witnesses of a cell share a row or column: one that is cut, or floats, is one witness less.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ LEAST = 128
 
 _PIECE = 8  # frames
 _WEIGHS = 8.0  # pieces that the share of the cell itself is worth
-_SHARING = 2  # witnesses on a wire of the cell
+_LOOKED_AT = 64  # cells that may be its witnesses
 _FEWEST = 8  # pieces in which a cell moves that is judged, or tells of others
 _BEYOND = 0.1  # of full scale: outside of what the reference shows
 _SILENT = 32  # fresh frames without a reading, at least
@@ -182,14 +182,23 @@ def find_witnesses(
     found = np.zeros((layout.n_cells, WITNESSES), np.uint16)
     told = np.zeros(layout.n_cells, bool)
     for cell in np.flatnonzero(living).tolist():
-        best = np.argsort(-confidence[:, cell], kind="stable")[: 8 * WITNESSES]
-        best = best[living[best] & (best != cell)]
-        on_wire = sharing[cell, best]
-        chosen = best[~on_wire | (np.cumsum(on_wire) <= _SHARING)][:WITNESSES]
+        best = np.argsort(-confidence[:, cell], kind="stable")
+        chosen = _apart(best[living[best] & (best != cell)][:_LOOKED_AT], sharing)
         if len(chosen) == WITNESSES:
             found[cell] = chosen
             told[cell] = True
     return found, told
+
+
+def _apart(best: NDArray[np.intp], sharing: Mask) -> list[int]:
+    """Return the first cells of which no two share a wire."""
+    chosen: list[int] = []
+    for one in best.tolist():
+        if not sharing[one, chosen].any():
+            chosen.append(one)
+        if len(chosen) == WITNESSES:
+            break
+    return chosen
 
 
 def _sharing(layout: SensorLayout) -> Mask:

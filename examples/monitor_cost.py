@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from adaptfault.firmware import Limits, monitor_source
-from adaptfault.firmware.counting import TOP, WITNESSES
+from adaptfault.firmware.counting import PREDICTORS, TOP
 from diagnostics import SensorLayout
 
 FRAMES = (4, 12)  # of two runs: their difference is free of the start
@@ -87,10 +87,10 @@ CALLS = {
 
 
 def limits_of(layout: SensorLayout) -> Limits:
-    """Return limits with the four cells behind each one as witnesses: the cost does not depend on
+    """Return limits with the four cells behind each one as predictors: the cost does not depend on
     the numbers."""
     cells = np.arange(layout.n_cells)
-    behind = cells[:, None] + np.arange(1, WITNESSES + 1)
+    behind = cells[:, None] + np.arange(1, PREDICTORS + 1)
     return Limits(
         per_unit=1.0,
         dither=5,
@@ -101,7 +101,7 @@ def limits_of(layout: SensorLayout) -> Limits:
         lowest=np.full(layout.n_cells, -TOP, np.int16),
         highest=np.full(layout.n_cells, TOP, np.int16),
         stuck_after=np.full(layout.n_cells, 200, np.uint16),
-        witnesses=(behind % layout.n_cells).astype(np.uint16),
+        predictors=(behind % layout.n_cells).astype(np.uint16),
     )
 
 

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 
 from adaptfault.cli import main
 from adaptfault.firmware import CellState, CountingMonitor, Limits, monitor_source
-from adaptfault.firmware.counting import MISSING, SETTLED, TOP, WITNESSES
+from adaptfault.firmware.counting import MISSING, PREDICTORS, SETTLED, TOP
 from adaptfault.firmware.learning import counts_per_unit, from_recordings
 from diagnostics import SensorLayout
 
@@ -105,7 +105,7 @@ def known(layout: SensorLayout, dither: int, near: int) -> Limits:
         lowest=np.full(cells, -TOP, np.int16),
         highest=np.full(cells, TOP, np.int16),
         stuck_after=np.zeros(cells, np.uint16),
-        witnesses=np.zeros((cells, WITNESSES), np.uint16),
+        predictors=np.zeros((cells, PREDICTORS), np.uint16),
     )
 
 
@@ -120,7 +120,7 @@ def hasty() -> Limits:
     """Limits of six cells that any few frames reach."""
     layout = SensorLayout(1, 2, 3)
     few = known(layout, 2, 1)
-    witnesses = np.array([[1, 2, 3, 4], [0, 2, 3, 5], [1, 0, 5, 4], [0, 0, 1, 2]] * 2, np.uint16)
+    predictors = np.array([[1, 2, 3, 4], [0, 2, 3, 5], [1, 0, 5, 4], [0, 0, 1, 2]] * 2, np.uint16)
     return Limits(
         **{
             **vars(few),
@@ -129,7 +129,7 @@ def hasty() -> Limits:
             "lowest": np.array([-3, -2, 0, -9, -9, -9], np.int16),
             "highest": np.array([3, 9, 9, 2, 9, 9], np.int16),
             "stuck_after": np.array([1, 2, 3, 0, 1, 5], np.uint16),
-            "witnesses": witnesses[:6],
+            "predictors": predictors[:6],
         }
     )
 
@@ -205,7 +205,7 @@ def test_the_c_says_of_real_recordings_what_the_python_says(name, tmp_path):
     assert np.array_equal(frozen, expected_frozen)
 
 
-def test_a_cell_that_holds_a_value_while_its_witnesses_move_is_stuck_and_no_healthy_one(limits):
+def test_a_cell_that_holds_a_value_while_its_predictors_move_is_stuck_and_no_healthy_one(limits):
     frames = passing(ARRAY, 150, seed=1)
     healthy, _ = told_in_python(limits, frames)
     assert not healthy.any()
@@ -217,7 +217,7 @@ def test_a_cell_that_holds_a_value_while_its_witnesses_move_is_stuck_and_no_heal
         assert not np.delete(told, dead, axis=1).any()
 
 
-def test_a_cut_row_is_stuck_as_witnesses_are_not_all_on_it(limits):
+def test_a_cut_row_is_stuck_as_predictors_are_not_all_on_it(limits):
     frames = passing(ARRAY, 300, seed=1)
     row = ARRAY.cell(0, 3, 0) + np.arange(ARRAY.cols)
     frames[:, row] = 0

@@ -1,20 +1,20 @@
 """The monitor for the microcontroller, in Python: what ``monitor.c`` computes, integer by integer.
 
 A reading is a whole count, or missing. For each frame and cell, with ``d`` the dither, ``w`` the
-number of witnesses that have to move:
+number of predictors that have to move:
 
     run       frames since the readings of the cell left a range of ``d`` last
-    seen      fresh frames of the run in which ``w`` of the cell's witnesses left theirs
+    seen      fresh frames of the run in which ``w`` of the cell's predictors left theirs
     silent    frames since its last reading
     STUCK     seen > stuck_after        OUTSIDE  run >= settled and all of it beyond lowest, highest
     SILENT    silent > silent_after     FROZEN   one frame more than ``patience`` times in a row,
                                                  with three cells or more away from rest
 
-A witness is a cell that moves when this cell does: in fault-free recordings ``seen`` never came
+A predictor is a cell that moves when this cell does: in fault-free recordings ``seen`` never came
 near ``stuck_after``. A frame that repeats the one before it tells nothing of a cell.
 
-Not detected: a cell that moves but is wrong; one whose witnesses are dead, too, all but one; one
-that its witnesses hardly told of in the reference (``stuck_after`` 0: never stuck). A wire is not
+Not detected: a cell that moves but is wrong; one whose predictors are dead, too, all but one; one
+that its predictors hardly told of in the reference (``stuck_after`` 0: never stuck). A wire is not
 named; the diagnosis on the robot does both.
 """
 
@@ -32,11 +32,11 @@ MISSING = -32768
 TOP = 32767
 """The highest count."""
 
-WITNESSES = 4
-"""Witnesses of each cell."""
+PREDICTORS = 4
+"""Predictors of each cell."""
 
 TELL = 2
-"""Witnesses that have to move in one frame."""
+"""Predictors that have to move in one frame."""
 
 SETTLED = 32
 """Frames of a run that lies outside the range."""
@@ -71,7 +71,7 @@ class Limits:
         silent_after: fresh frames without a reading, at most 65534.
         rest, lowest, highest: int16 ``[D]``, reading without a load, and the healthy range.
         stuck_after: uint16 ``[D]``; 0: nothing tells of the cell, or there is none.
-        witnesses: uint16 ``[D, 4]``.
+        predictors: uint16 ``[D, 4]``.
     """
 
     per_unit: float
@@ -83,7 +83,7 @@ class Limits:
     lowest: Counts
     highest: Counts
     stuck_after: NDArray[np.uint16]
-    witnesses: NDArray[np.uint16]
+    predictors: NDArray[np.uint16]
 
     def counts(self, frames: NDArray[np.floating]) -> Counts:
         """Return readings ``[..., D]`` in the layout's unit as counts; NaN, infinite: missing."""
@@ -132,7 +132,7 @@ class CountingMonitor:
         self.last = np.where(received, reading, self.last)
         self.run = np.where(moved, 0, np.minimum(self.run + 1, _MOST))
         self.silent = np.where(received, 0, np.minimum(self.silent + 1, _MOST))
-        tell = moved[self.limits.witnesses].sum(axis=1) >= TELL
+        tell = moved[self.limits.predictors].sum(axis=1) >= TELL
         self.seen = np.where(moved, 0, np.minimum(self.seen + tell, _MOST))
 
     @property

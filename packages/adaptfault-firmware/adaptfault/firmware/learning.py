@@ -1,14 +1,14 @@
 """Limits of the monitor for the microcontroller, from a fitted diagnosis and fault-free recordings.
 
 The diagnosis brings the dither, the rest of each cell, and how often healthy frames repeat. The
-recordings, one behind the other, bring the range of each cell, its witnesses, and how many frames
-its witnesses moved in at most while it did not:
+recordings, one behind the other, bring the range of each cell, its predictors, and how many frames
+its predictors moved in at most while it did not:
 
     confidence(j tells of i) = (pieces in which both move + a p) / (pieces in which j moves + a)
     stuck_after              = MARGIN x most frames + LEAST
 
 with pieces of 8 frames, p the share of the pieces in which i moves, and a = 8. No two of the four
-witnesses of a cell share a row or column: one that is cut, or floats, is one witness less.
+predictors of a cell share a row or column: one that is cut, or floats, is one predictor less.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from adaptfault.firmware.counting import MISSING, TOP, WITNESSES, CountingMonitor, Counts, Limits
+from adaptfault.firmware.counting import MISSING, PREDICTORS, TOP, CountingMonitor, Counts, Limits
 from diagnostics import SelfDiagnosis, SensorLayout
 
 MARGIN = 4.0
@@ -30,7 +30,7 @@ LEAST = 128
 
 _PIECE = 8  # frames
 _WEIGHS = 8.0  # pieces that the share of the cell itself is worth
-_LOOKED_AT = 64  # cells that may be its witnesses
+_LOOKED_AT = 64  # cells that may be its predictors
 _FEWEST = 8  # pieces in which a cell moves that is judged, or tells of others
 _BEYOND = 0.1  # of full scale: outside of what the reference shows
 _SILENT = 32  # fresh frames without a reading, at least
@@ -78,7 +78,7 @@ def learn_limits(diagnoser: SelfDiagnosis, recordings: Sequence[ArrayLike]) -> L
         lowest=np.full(layout.n_cells, -TOP, np.int16),
         highest=np.full(layout.n_cells, TOP, np.int16),
         stuck_after=np.zeros(layout.n_cells, np.uint16),
-        witnesses=np.zeros((layout.n_cells, WITNESSES), np.uint16),
+        predictors=np.zeros((layout.n_cells, PREDICTORS), np.uint16),
     )
     living = layout.present.ravel() & (reference.dead == 0)
     return from_recordings(known, [known.counts(one) for one in frames], layout, living)
@@ -93,7 +93,7 @@ def counts_per_unit(layout: SensorLayout, step: float) -> float:
 def from_recordings(
     known: Limits, recordings: Sequence[Counts], layout: SensorLayout, living: Mask
 ) -> Limits:
-    """Return limits with what fault-free recordings bring: ranges, witnesses, and how long cells
+    """Return limits with what fault-free recordings bring: ranges, predictors, and how long cells
     hold.
 
     Args:
@@ -106,8 +106,8 @@ def from_recordings(
     moves = _moves(known, stream)
     pieces = np.add.reduceat(moves, np.arange(0, len(moves), _PIECE), axis=0) > 0
     living = living & (pieces.sum(axis=0) >= _FEWEST)
-    witnesses, told = find_witnesses(pieces, layout, living)
-    limits = replace(known, witnesses=witnesses)
+    predictors, told = find_predictors(pieces, layout, living)
+    limits = replace(known, predictors=predictors)
     most, silent = _most(limits, stream)
     after = np.minimum(MARGIN * most + LEAST, _STUCK)
     lowest, highest = _ranges(limits, stream, layout, living)
@@ -162,14 +162,14 @@ def _most(limits: Limits, stream: Counts) -> tuple[NDArray[np.int64], int]:
     return most, silent
 
 
-def find_witnesses(
+def find_predictors(
     pieces: Mask, layout: SensorLayout, living: Mask
 ) -> tuple[NDArray[np.uint16], Mask]:
-    """Return the witnesses of each cell, ``[D, 4]``, and which cells have enough, bool ``[D]``.
+    """Return the predictors of each cell, ``[D, 4]``, and which cells have enough, bool ``[D]``.
 
     Args:
         pieces: bool ``[n, D]``, pieces in which each cell moves.
-        layout: of the array; witnesses may be on any pad.
+        layout: of the array; predictors may be on any pad.
         living: bool ``[D]``, cells that work and move.
     """
     moving = pieces.astype(np.float64)
@@ -179,12 +179,12 @@ def find_witnesses(
     confidence[~living] = -1.0
     np.fill_diagonal(confidence, -1.0)
     sharing = _sharing(layout)
-    found = np.zeros((layout.n_cells, WITNESSES), np.uint16)
+    found = np.zeros((layout.n_cells, PREDICTORS), np.uint16)
     told = np.zeros(layout.n_cells, bool)
     for cell in np.flatnonzero(living).tolist():
         best = np.argsort(-confidence[:, cell], kind="stable")
         chosen = _apart(best[living[best] & (best != cell)][:_LOOKED_AT], sharing)
-        if len(chosen) == WITNESSES:
+        if len(chosen) == PREDICTORS:
             found[cell] = chosen
             told[cell] = True
     return found, told
@@ -196,7 +196,7 @@ def _apart(best: NDArray[np.intp], sharing: Mask) -> list[int]:
     for one in best.tolist():
         if not sharing[one, chosen].any():
             chosen.append(one)
-        if len(chosen) == WITNESSES:
+        if len(chosen) == PREDICTORS:
             break
     return chosen
 

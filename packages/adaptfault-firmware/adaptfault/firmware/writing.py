@@ -8,7 +8,7 @@ from string import Template
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptfault.firmware.counting import AWAY, SETTLED, TELL, WITNESSES, Limits
+from adaptfault.firmware.counting import AWAY, PREDICTORS, SETTLED, TELL, Limits
 from diagnostics import SensorLayout
 
 _IN_A_LINE = 16
@@ -31,7 +31,7 @@ def monitor_source(limits: Limits, layout: SensorLayout) -> str:
         near=limits.near,
         patience=limits.patience,
         silent_after=limits.silent_after,
-        n_witnesses=WITNESSES,
+        n_predictors=PREDICTORS,
         tell=TELL,
         settled=SETTLED,
         away=AWAY,
@@ -39,7 +39,7 @@ def monitor_source(limits: Limits, layout: SensorLayout) -> str:
         lowest=_table(limits.lowest),
         highest=_table(limits.highest),
         stuck_after=_table(limits.stuck_after),
-        witnesses=_table(limits.witnesses),
+        predictors=_table(limits.predictors),
     )
 
 

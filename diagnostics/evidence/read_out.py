@@ -8,18 +8,19 @@ e their standard errors::
     response  r = (m_1 - m_d) / (1 - d)      (m_d - b) / d where the full drive saturates
     ratio       = (m_d - b) / (d r)          1: it answers in proportion
                   b: 0 or z, what is nearer: a row that is driven has no residue by floating
-    evidence    = log p(r | open) - log p(r | healthy),  limited to +- 12
-                  p(r | open) = N(0, e),  p(r | healthy): log r is normal around the median of all
+    evidence    = log P(r < 5 e | open) - log P(r < 5 e | healthy),  at most 12, of silent ones
+                  healthy: log r is normal around the median u of those that answer, r > 5 e, with
+                  the deviation s of them, or of their wider tail: Phi((log 5 e - log u) / s)
 
-Each density is contaminated (1 %). A healthy crossing conducts a little also where nobody touches
-it; a scan that sees less than half of them conduct tells of shorts only. Where some healthy ones do
-not, a scan of the healthy array leaves them out (:meth:`ReadOut.since`). A crossing that saturates
-at the low level, and not without the drive, is shorted: at the low level the full scale of a cell
-reads half of the converter's range at most. One that saturates at all levels is on a column that is
-held at the supply; what has no response of its own but a residue is on one, too. A line on ground
-answers faintly: less than 3 % of the usual response in the median of its crossings. The line cover
-(:mod:`diagnostics.decision.line_cover`) names lines. Shorted crossings join others in parallel:
-these tell nothing.
+A silent crossing is open from an evidence of 9.2 on, or where its line is. A healthy crossing
+conducts a little also where nobody touches it; a scan that sees less than half of them conduct
+tells of shorts only. Where some healthy ones do not, a scan of the healthy array leaves them out
+(:meth:`ReadOut.since`). A crossing that saturates at the low level, and not without the drive, is
+shorted: at the low level the full scale of a cell reads half of the converter's range at most. One
+that saturates at all levels is on a column that is held at the supply; what has no response of its
+own but a residue is on one, too. A line on ground answers faintly: less than 3 % of the usual
+response in the median of its crossings. The line cover (:mod:`diagnostics.decision.line_cover`)
+names lines. Shorted crossings join others in parallel: these tell nothing.
 
 Not detected: what leaves a crossing conducting, as a worn, late or clamped cell, or two lines that
 are joined; a line of which all crossings are shorted or open only under load. A line that is cut
@@ -31,16 +32,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.special import expit, logit
+from scipy.special import expit, log_ndtr, logit, ndtri
 
 from diagnostics.decision.line_cover import Cause, solve
 from diagnostics.decision.result import Diagnosis
 from diagnostics.faults import Fault, FaultKind
 from diagnostics.layout import SensorLayout
-from diagnostics.preprocessing.levels import CERTAIN_RATIO, EXPECTED, MAJORITY
+from diagnostics.preprocessing.levels import CERTAIN_RATIO, EXPECTED, LOW, MAJORITY
 
 TOP = 0.98
 """Share of the converter's range from which on a reading is saturated."""
@@ -48,14 +50,15 @@ TOP = 0.98
 REPEATS = 4
 """Readings of a crossing at a level, at least."""
 
-_SEEN = 20.0  # standard errors of the response of a usual crossing: the scan sees it
-_WIDEST = 1.0  # standard deviation of log r of healthy crossings, at least
-_OTHERWISE = 0.01  # of either density: anything
+_OPEN = 9.2  # evidence of an open crossing: one healthy one in 10,000 is as silent
+_CLEARLY = 4.0  # times the least answer
+_LEAST_SPREAD = 0.5  # standard deviation of log r of healthy crossings
 _STANDS = 5.0  # standard errors that are no noise
 _IN_PROPORTION = 0.25  # ratio - 1
 _RESIDUE = 0.02  # of the usual response: a residue of a line, not of the converter
 _FAINT = 0.03  # of it: a line on ground
 _FEWEST = 3  # crossings of such a line
+_OF_MEDIAN = 1.25  # standard error of a median, in those of a mean
 _LOADED = 10.0  # times the usual response: as under load
 
 Floats = NDArray[np.float64]
@@ -124,9 +127,11 @@ class ReadOut:
     Attributes:
         layout: the array.
         response, residue: float, shares of the converter's range; NaN: not measured.
+        least: float, the response from which on a crossing answers.
         ratio: float, 1 where the crossing answers both drives in proportion; NaN: not measured.
         evidence: float, log likelihood ratio faulty : healthy; 0: none.
-        open, short, held, alive: bool; ``held``: on a line at the supply.
+        open, short, held, alive: bool; ``open``: silent ones, certain or not, ``held``: on a line
+            at the supply.
         under_load: number of crossings that conduct as under a load.
         incomplete: what of the scan is missing, one sentence; "": nothing.
     """
@@ -134,6 +139,7 @@ class ReadOut:
     layout: SensorLayout
     response: Floats
     residue: Floats
+    least: Floats
     ratio: Floats
     evidence: Floats
     open: Mask
@@ -143,17 +149,20 @@ class ReadOut:
     under_load: int = 0
     incomplete: str = ""
 
-    @property
+    @cached_property
     def broken(self) -> Mask:
-        """The crossings that show a fault, bool ``[D]``."""
-        return self.open | self.short | self.held
+        """The crossings of all faults, bool ``[D]``."""
+        found = np.zeros(self.layout.n_cells, bool)
+        found[[cell for fault in self.faults for cell in fault.cells]] = True
+        return found
 
-    @property
+    @cached_property
     def faults(self) -> tuple[Fault, ...]:
         """One fault a cause: a line, or a crossing."""
         silent = self.open | self.held
-        weight = np.abs(self.evidence)
-        causes = list(solve(silent, silent, self.alive | self.short, weight, self.layout))
+        certain = silent & (self.evidence >= _OPEN)
+        others = self.alive | self.short
+        causes = list(solve(certain, silent, others, self.evidence, self.layout))
         shorted = [Cause(None, (c,), (c,), 1.0) for c in np.flatnonzero(self.short).tolist()]
         return tuple(self._fault(cause) for cause in [*causes, *shorted] if cause.proven)
 
@@ -172,8 +181,8 @@ class ReadOut:
         )
 
     def since(self, healthy: ReadOut) -> ReadOut:
-        """Return what is new since a scan of the healthy array: crossings that did not answer then
-        are not tested now.
+        """Return what is new since a scan of the healthy array: a crossing that answered clearly
+        then and is silent now is open; one that did not answer then is not tested.
 
         Raises:
             ValueError: a scan of another array.
@@ -181,10 +190,15 @@ class ReadOut:
         if healthy.layout.shape != self.layout.shape:
             raise ValueError(f"a scan of {self.layout}, but a healthy one of {healthy.layout}")
         known = healthy.alive
+        clear = known & (np.nan_to_num(healthy.response) > _CLEARLY * self.least)
+        evidence = np.where(clear & self.open, CERTAIN_RATIO, self.evidence)
         return replace(
             self,
-            evidence=np.where(known, self.evidence, 0.0),
-            **{name: getattr(self, name) & known for name in ("open", "short", "held", "alive")},
+            evidence=np.where(known, evidence, 0.0),
+            open=self.open & clear,
+            short=self.short & known,
+            held=self.held & known,
+            alive=self.alive & known,
         )
 
     @property
@@ -222,7 +236,7 @@ def judge_scan(scan: Scan, layout: SensorLayout) -> ReadOut:
         unknown = np.full(cells, np.nan)
         return ReadOut(
             layout,
-            *(unknown,) * 3,
+            *(unknown,) * 4,
             np.zeros(cells),
             *(nothing,) * 4,
             incomplete=missing,
@@ -342,23 +356,25 @@ def _judged(zero: _Level, low: _Level, full: _Level, share: float, layout: Senso
     tells = measured & ~short & ~everywhere & ~_in_parallel(short, layout)
     answer = _Answer.of(zero, low, full, share)
     answers = tells & (answer.response > _STANDS * answer.error)
-    evidence = np.zeros(layout.n_cells)
+    silent = tells & (np.abs(answer.response) <= _STANDS * answer.error)
     usual = 0.0
-    if answers.sum() >= MAJORITY * measured.sum() > 0:
-        usual = float(np.median(answer.response[answers]))
     faint = np.zeros_like(tells)
-    if usual and usual > _SEEN * float(np.median(answer.error[tells])):
-        faint = _on_faint_lines(answer.response, usual, tells, layout)
-        evidence[tells] = _log_ratio(answer.response[tells], answer.error[tells], usual)
-    silent = tells & (evidence > 0) & ~answers
+    evidence = np.where(answers, -CERTAIN_RATIO, 0.0)
+    if answers.sum() >= MAJORITY * measured.sum() > 0:
+        healthy = _Healthy.of(answer.response[answers])
+        usual = healthy.usual
+        evidence[silent] = healthy.of_silence(_STANDS * answer.error[silent])
+        faint = _on_faint_lines(answer.response, healthy, tells, layout)
+    silent &= evidence > 0
     no_answer = silent | faint
     at_supply = no_answer & (zero.mean > _STANDS * zero.error + _RESIDUE * usual)
-    alive = answers & answer.in_proportion & (evidence < 0) & ~faint
+    alive = answers & answer.in_proportion & ~faint & (usual > 0)
     certain = short | everywhere | faint
     return ReadOut(
         layout,
         np.where(measured, answer.response, np.nan),
         np.where(measured, zero.mean, np.nan),
+        _STANDS * answer.error,
         np.where(answers, answer.ratio, np.nan),
         np.where(certain, CERTAIN_RATIO, evidence),
         open=no_answer & ~at_supply,
@@ -399,7 +415,7 @@ class _Answer:
         return cls(response, error, ratio, np.abs(ratio - 1) <= apart)
 
 
-def _on_faint_lines(response: Floats, usual: float, tells: Mask, layout: SensorLayout) -> Mask:
+def _on_faint_lines(response: Floats, healthy: _Healthy, tells: Mask, layout: SensorLayout) -> Mask:
     """Return the crossings on rows and columns that answer faintly, bool ``[D]``."""
     found = np.zeros(layout.n_cells, bool)
     for line in layout.lines:
@@ -407,8 +423,9 @@ def _on_faint_lines(response: Floats, usual: float, tells: Mask, layout: SensorL
         cells = cells[tells[cells]]
         if line.kind not in ("row", "column") or len(cells) < _FEWEST:
             continue
-        if np.median(response[cells]) < _FAINT * usual:
-            found[cells[response[cells] < _FAINT * usual]] = True
+        least = healthy.faint(len(cells))
+        if np.median(response[cells]) < least:
+            found[cells[response[cells] < least]] = True
     return found
 
 
@@ -423,18 +440,42 @@ def _in_parallel(short: Mask, layout: SensorLayout) -> Mask:
     return found
 
 
-def _log_ratio(response: Floats, error: Floats, usual: float) -> Floats:
-    """Return log p(r | open) - log p(r | healthy), within +- 12."""
-    span = 1.0 / max(float(np.max(response)), usual)  # density of anything
-    of_open = np.exp(-0.5 * (response / error) ** 2) / (error * np.sqrt(2 * np.pi))
-    positive = np.maximum(response, 1e-12)
-    off = np.log(positive / usual) / _WIDEST
-    of_healthy = np.exp(-0.5 * off**2) / (positive * _WIDEST * np.sqrt(2 * np.pi))
-    of_healthy = np.where(response > 0, of_healthy, 0.0)
-    open_ = (1 - _OTHERWISE) * of_open + _OTHERWISE * span
-    healthy = (1 - _OTHERWISE) * of_healthy + _OTHERWISE * span
-    ratio: Floats = np.clip(np.log(open_ / healthy), -CERTAIN_RATIO, CERTAIN_RATIO)
-    return ratio
+@dataclass(frozen=True)
+class _Healthy:
+    """How healthy crossings answer: log response is normal.
+
+    Attributes:
+        usual: median response.
+        spread: standard deviation of its logarithm, of the middle half.
+        tail: the same, of the wider tail, which a line on ground may make.
+    """
+
+    usual: float
+    spread: float
+    tail: float
+
+    @classmethod
+    def of(cls, response: Floats) -> _Healthy:
+        """Return that of crossings which answer, ``[n]``."""
+        log = np.log(response)
+        middle = float(np.median(log))
+        half = 1.4826 * float(np.median(np.abs(log - middle)))
+        low, high = np.quantile(log, [LOW, 1 - LOW]).tolist()
+        tail = max(middle - low, high - middle) / -float(ndtri(LOW))
+        spread = max(_LEAST_SPREAD, half)
+        return cls(float(np.exp(middle)), spread, max(spread, tail))
+
+    def of_silence(self, least: Floats) -> Floats:
+        """Return the evidence of crossings that answer less than ``least``: how many healthy ones
+        do."""
+        as_silent = (np.log(least) - np.log(self.usual)) / self.tail
+        evidence: Floats = np.clip(-log_ndtr(as_silent), 0.0, CERTAIN_RATIO)
+        return evidence
+
+    def faint(self, crossings: int) -> float:
+        """Return the median response of so many that is less than chance gives."""
+        by_chance = _STANDS * _OF_MEDIAN * self.spread / np.sqrt(crossings)
+        return self.usual * float(min(_FAINT, np.exp(-by_chance)))
 
 
 def _reason(kind: FaultKind, cause: Cause, held: bool, layout: SensorLayout) -> str:

@@ -143,6 +143,30 @@ def test_crossings_that_did_not_answer_in_the_healthy_array_are_not_tested():
     assert not healthy.since(healthy).faults
 
 
+def idle_of(spread: float, seed: int) -> np.ndarray:
+    """Return preloads of which the logarithm has a standard deviation."""
+    rng = np.random.default_rng(seed)
+    return np.clip(0.005 * np.exp(rng.normal(0, spread, LAYOUT.n_cells)), 0, 1)
+
+
+@given(st.integers(0, 10**6), st.floats(0, 4))
+def test_no_healthy_crossing_is_blamed_however_differently_they_conduct(seed, spread):
+    circuit = Circuit(LAYOUT, idle_ohms=1e9)
+    found = judge_scan(scan_circuit(circuit, idle_of(spread, seed), seed=seed), LAYOUT)
+    assert not found.faults
+
+
+@given(st.integers(0, 10**6), st.floats(0, 4))
+def test_a_healthy_scan_tells_which_silent_crossing_is_open(seed, spread):
+    idle = idle_of(spread, seed)
+    circuit = Circuit(LAYOUT, idle_ohms=1e9)
+    healthy = judge_scan(scan_circuit(circuit, idle, seed=seed), LAYOUT)
+    cell = int(np.nanargmax(np.where(healthy.alive, healthy.response, np.nan)))
+    broken = circuit.with_faults(StuckCell(cell, np.inf))
+    found = judge_scan(scan_circuit(broken, idle, seed=seed + 1), LAYOUT).since(healthy)
+    assert blamed(found) == {cell}
+
+
 def test_an_array_of_which_most_crossings_do_not_conduct_untouched_has_no_open_one():
     few = [StuckCell(cell, np.inf) for cell in range(LAYOUT.n_cells) if cell % 5]
     assert not judge_scan(scan_of(*few), LAYOUT).faults

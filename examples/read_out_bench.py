@@ -5,8 +5,7 @@ on the circuit of an array.
 
 Each array has two open crossings, a shorted one of up to 1 kiloohm, and every second one a row or
 column that is cut somewhere. Preload, leakage to ground (1 megaohm to 1 gigaohm) and the noise of
-the converter (12 bits) differ from array to array. An open crossing in parallel with another one,
-through a short, cannot be told by any reading: it counts as not found.
+the converter (12 bits) differ from array to array.
 """
 
 import argparse

@@ -112,13 +112,6 @@ class Scan:
             )
         return cls(np.array([level for level, _ in frames]), np.stack(readings))
 
-    def joined(self, other: Scan) -> Scan:
-        """Return this scan and another one of the same array as one."""
-        return Scan(
-            np.concatenate([self.levels, other.levels]),
-            np.concatenate([self.readings, other.readings]),
-        )
-
 
 @dataclass(frozen=True, eq=False)
 class ReadOut:

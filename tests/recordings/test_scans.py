@@ -122,6 +122,14 @@ def test_each_frame_of_a_block_is_a_reading_or_of_a_scan(given_levels):
     assert [level for level, _ in taken] == scan[~np.isnan(scan)].tolist()
 
 
+def test_a_mask_of_recordings_with_a_scan_is_refused_in_one_line(tmp_path, capsys):
+    (tmp_path / "log.csv").write_text(table(*mixed()))
+    out = str(tmp_path / "valid.npz")
+    arguments = ["check", str(tmp_path / "log.csv"), "--shape", "6x5", "--write-valid", out]
+    assert main([*arguments, "--full-scale", "255"]) == 3
+    assert "leave the scan out" in capsys.readouterr().err.strip().splitlines()[-1]
+
+
 def test_diagnose_tells_what_the_scan_says_with_nobody_touching(tmp_path, capsys):
     rest = np.full((40, D), 3)
     (tmp_path / "today.csv").write_text(table(np.full(40, np.nan), rest))

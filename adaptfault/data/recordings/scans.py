@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptfault.data.recordings.errors import Problem, located
+from adaptfault.data.recordings.errors import Problem
 from adaptfault.data.recordings.recording import Block, Recording
 
 if TYPE_CHECKING:
@@ -79,7 +79,7 @@ def doubt_of(block: Block, path: Path) -> tuple[Problem, ...]:
     called = block.scan is not None and bool(np.isfinite(block.scan).any())
     if not called or _of_scan(block) is not None:
         return ()
-    return (Problem("warning", located(path, _NO_SCAN)),)
+    return (Problem.warning(path, _NO_SCAN),)
 
 
 def readings_of(recording: Recording) -> Recording:

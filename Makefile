@@ -101,7 +101,7 @@ format: .venv/installed-dev
 	@touch $@
 
 install-dev:
-	$(INSTALL) $(CONSTRAINTS) -e '.[dev]' -e './packages/adaptfault-bench[mujoco]' -e ./packages/adaptfault-paper \
+	$(INSTALL) $(CONSTRAINTS) -e '.[dev]' -e './packages/adaptfault-bench[mujoco]' -e ./packages/adaptfault-firmware -e ./packages/adaptfault-paper \
 		-e ./packages/adaptfault-prognosis -e './packages/adaptfault-station[ros2]'
 
 .venv/installed-docs: .venv/installed

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from diagnostics.decision.result import Diagnosis, Verdict
     from diagnostics.decision.static_load import StaticLoad
     from diagnostics.diagnosis import SelfDiagnosis
+    from diagnostics.evidence.read_out import ReadOut, Scan, judge_scan, with_scan
     from diagnostics.faults import Fault, FaultKind, FaultSet
     from diagnostics.layout import SensorLayout
     from diagnostics.monitor import Monitor
@@ -40,6 +41,8 @@ _HOMES = {
     "FaultSet": "faults",
     "Line": "wiring",
     "Monitor": "monitor",
+    "ReadOut": "evidence.read_out",
+    "Scan": "evidence.read_out",
     "SelfDiagnosis": "diagnosis",
     "SensorLayout": "layout",
     "StaticLoad": "decision.static_load",
@@ -48,8 +51,10 @@ _HOMES = {
     "bridge": "simulation.injection",
     "freeze_stream": "simulation.injection",
     "inject": "simulation.injection",
+    "judge_scan": "evidence.read_out",
     "line_fault": "simulation.injection",
     "lose_frames": "simulation.injection",
+    "with_scan": "evidence.read_out",
 }
 
 __all__ = [
@@ -61,6 +66,8 @@ __all__ = [
     "FaultSet",
     "Line",
     "Monitor",
+    "ReadOut",
+    "Scan",
     "SelfDiagnosis",
     "SensorLayout",
     "StaticLoad",
@@ -69,8 +76,10 @@ __all__ = [
     "bridge",
     "freeze_stream",
     "inject",
+    "judge_scan",
     "line_fault",
     "lose_frames",
+    "with_scan",
 ]
 
 

@@ -26,6 +26,7 @@ from diagnostics.decision.serialization import (
     write_state,
 )
 from diagnostics.evidence.cold_start import judged_cold
+from diagnostics.evidence.read_out import Scan, scanned
 from diagnostics.evidence.reference import Reference, highest_reading, living
 from diagnostics.evidence.stream_state import StreamState
 from diagnostics.faults import Fault, FaultKind
@@ -275,11 +276,16 @@ class SelfDiagnosis:
         return blamed
 
     def diagnose(
-        self, recordings: ArrayLike | Sequence[ArrayLike], *, classes: ArrayLike | None = None
+        self,
+        recordings: ArrayLike | Sequence[ArrayLike],
+        *,
+        classes: ArrayLike | None = None,
+        scan: Scan | None = None,
     ) -> Diagnosis:
         """Diagnose a log: recordings ``[T, D]`` or a list of them, in time order.
 
         ``classes`` is the class of each recording, ``[n]``: a fault may show in one class only.
+        ``scan``: of the read-out that tests itself (:mod:`diagnostics.evidence.read_out`).
 
         Without :meth:`fit` (cold start), a log of 32 recordings or more is its own reference
         (:meth:`for_log`), which takes the time of a fit. In a shorter one, cells are compared with
@@ -290,12 +296,12 @@ class SelfDiagnosis:
         """
         shared = self.shared(recordings)
         if shared.explains_all:
-            return shared.diagnosis()
+            return scanned(shared.diagnosis(), scan)
         log = RecordingBlocks(shared.recordings)
         with one_thread():
             own = self.for_log(log.given, classes=classes)
             known = shared.crosstalk if own is self else None  # else it is learned
-            return shared.told(own._diagnosed_when(log, classes, known))
+            return scanned(shared.told(own._diagnosed_when(log, classes, known)), scan)
 
     def shared(self, recordings: ArrayLike | Sequence[ArrayLike]) -> Shared:
         """Return what the array as a whole does in a log, as :meth:`diagnose` takes it.

@@ -37,12 +37,14 @@ else:
     raise AssertionError("the core brings a station")
 """
 BESIDE = """
-import sys, adaptfault, adaptfault.bench, adaptfault.paper, adaptfault.prognosis, adaptfault.ros2
+import sys, adaptfault, adaptfault.bench, adaptfault.firmware, adaptfault.paper
+import adaptfault.prognosis, adaptfault.ros2
 import diagnostics.simulation.circuit as circuit
 for package in (adaptfault.bench, circuit, sys.modules[adaptfault.Station.__module__]):
     assert package.__file__.startswith(sys.prefix), package.__file__
 """
 APART = {
+    "export-monitor": "adaptfault-firmware",
     "listen": "adaptfault-station",
     "reproduce": "adaptfault-paper",
     "fleet survival": "adaptfault-prognosis",

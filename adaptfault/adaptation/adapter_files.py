@@ -130,6 +130,24 @@ def load_adapter(path: Place) -> Adapter:
     return adapter
 
 
+def load_recordings(path: Place) -> list[NDArray[np.float32]] | None:
+    """Return the recordings of the windows that :func:`save_adapter` wrote, ``[T, D]`` each on the
+    0..1 scale: the windows of each, one behind the other; None: some windows were left out.
+
+    Raises:
+        FileNotFoundError, ValueError: as :func:`load_adapter`.
+    """
+    about, tensors = load_tensors(path, SCHEMA)
+    found = []
+    for name in ("train", "validation"):
+        windows = _unpack(about[name], tensors, name)
+        if len(windows) < about[name].get("of", len(windows)):
+            return None
+        numbers = np.unique(windows.recording)
+        found += [np.concatenate(windows.x[windows.recording == i]) for i in numbers]
+    return found
+
+
 def _bytes(tensors: dict[str, Tensor]) -> int:
     return sum(t.numel() * t.element_size() for t in tensors.values())
 

@@ -15,6 +15,9 @@ from adaptfault.models.store import InMemory, load_arrays, save_arrays
 from diagnostics import SelfDiagnosis
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
     from adaptfault.adaptation.adapter import Adapter
     from adaptfault.data.calibration import Calibration
     from adaptfault.data.windows import Windows
@@ -128,6 +131,25 @@ class Parts:
         part = self._files.below(_ADAPTER)
         with decoding(part.folder):
             return load_adapter(part)
+
+    def recordings(self, full_scale: float) -> list[NDArray[np.floating]]:
+        """Return the fault-free recordings ``[T, D]`` that the adapter's windows hold, in units of
+        ``full_scale``.
+
+        Raises:
+            ValueError: some windows of a large array were left out, so that there are none whole.
+        """
+        from adaptfault.adaptation.adapter_files import load_recordings
+
+        part = self._files.below(_ADAPTER)
+        with decoding(part.folder):
+            found = load_recordings(part)
+        if found is None:
+            raise ValueError(
+                f"{part.folder} keeps some windows of a large array, and no recording whole; give"
+                " the fault-free recordings"
+            )
+        return [full_scale * frames for frames in found]
 
     def check_windows(self) -> Windows:
         """Return the held-out windows on which a candidate and the running version are compared."""

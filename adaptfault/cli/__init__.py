@@ -48,11 +48,12 @@ _NAMES = (
     "history",
     "report",
     "listen",
+    "export-monitor",
     "fleet",
     "reproduce",
 )
 
-BUILT_IN = {name: f"adaptfault.cli.{name}" for name in _NAMES}
+BUILT_IN = {name: f"adaptfault.cli.{name.replace('-', '_')}" for name in _NAMES}
 """The commands in the order of ``--help``, as the entry points of the repository name them. Another
 package adds one by a module with ``add(subparsers)`` and an entry point in the same group."""
 

@@ -125,6 +125,11 @@ class Check(Inspecting):
         part = None if self.healthy is None else partial(_part, self.healthy)
         inspected = inspect_log(self, part)
         log = inspected.log
+        if log.scan is not None and (self.write_valid or self.write_copy):
+            raise ValueError(
+                "--write-valid, --write-copy: got recordings with a scan of the read-out, expected"
+                " readings alone; leave the scan out"
+            )
         report_range(log)
         groupings = dict(dividing(groupings_of(log, self.recordings)))
         if self.groups is not None:

@@ -62,6 +62,7 @@ class Command:
     """What all commands have.
 
     Attributes:
+        called: its name on the command line; "": that of the class.
         example: ends the help.
         one_of: options of which one may be given; ``one_is_needed``: has to be.
         continues: after an interruption the same command continues.
@@ -72,6 +73,7 @@ class Command:
         untold: the result could not be printed.
     """
 
+    called: ClassVar[str] = ""
     example: ClassVar[str]
     one_of: ClassVar[Sequence[str]] = ()
     one_is_needed: ClassVar[bool] = False
@@ -93,7 +95,7 @@ class Command:
         """Add the command to those of a parser."""
         summary = " ".join((cls.__doc__ or "").split()).removesuffix(".")
         parser = commands.add_parser(
-            cls.__name__.lower(),
+            cls.called or cls.__name__.lower(),
             help=f"{summary[0].lower()}{summary[1:]}",
             description=f"{summary}.",
             epilog=f"example:\n{cls.example}",

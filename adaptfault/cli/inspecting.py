@@ -87,6 +87,11 @@ def inspect_log(
         beside = None if args.no_cache or not args.reference else args.reference[0]
         diagnoser = fit_diagnoser(args, healthy, beside=beside)
     inspection = _inspected(args, log, diagnoser, bundle, _healthy(bundle, healthy))
+    if log.scan is not None:
+        from adaptfault.inspection.scanned import inspection_with_scan
+
+        inspection, found = inspection_with_scan(inspection, log.scan)
+        args.say(f"scan: {found.summary}")
     return InspectedLog(log, inspection, bundle)
 
 

@@ -12,8 +12,10 @@ from typing import Any
 
 APART = {
     "adaptfault.acquisition": "adaptfault-station",
+    "adaptfault.cli.export_monitor": "adaptfault-firmware",
     "adaptfault.cli.listen": "adaptfault-station",
     "adaptfault.cli.reproduce": "adaptfault-paper",
+    "adaptfault.firmware": "adaptfault-firmware",
     "adaptfault.prognosis": "adaptfault-prognosis",
 }
 """The package that brings a module, where it is installed on its own."""

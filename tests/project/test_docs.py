@@ -140,7 +140,7 @@ def test_options_that_the_pages_name_exist(capsys):
     for page in PAGES:
         for code in re.findall(r"`+([^`]*)`+", page.read_text()):
             for command, rest in re.findall(
-                r"^adaptfault (\w+(?: maintain| survival)?)(.*)$", code, re.MULTILINE
+                r"^adaptfault (\w[\w-]*(?: maintain| survival)?)(.*)$", code, re.MULTILINE
             ):
                 assert command.split()[0] in known, f"{page.name}: {code}"
                 with pytest.raises(SystemExit):

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +13,9 @@ from numpy.typing import NDArray
 from adaptfault.data.printable import printable
 from diagnostics import SensorLayout
 from diagnostics.shown import shown
+
+if TYPE_CHECKING:
+    from diagnostics import Scan
 
 
 @shown
@@ -31,6 +35,7 @@ class Recordings:
         targets: float32 ``[k]`` each, the values of a recording, or ``[T, k]``, those of its
             frames; None where there are none.
         value_names: one name a value.
+        scan: of the read-out, of all recordings together; None: there is none.
 
     Raises:
         ValueError: a recording that does not fit the layout; labels, class names, names, targets or
@@ -44,6 +49,7 @@ class Recordings:
     names: tuple[str, ...] = ()
     targets: tuple[NDArray[np.float32], ...] | None = None
     value_names: tuple[str, ...] = ()
+    scan: Scan | None = None
 
     def __post_init__(self) -> None:
         names = tuple(map(printable, self.names)) or tuple(
@@ -110,5 +116,12 @@ class Recordings:
         names = tuple(self.names[i] for i in which)
         targets = None if self.targets is None else tuple(self.targets[i] for i in which)
         return Recordings(
-            frames, self.layout, labels, self.class_names, names, targets, self.value_names
+            frames,
+            self.layout,
+            labels,
+            self.class_names,
+            names,
+            targets,
+            self.value_names,
+            self.scan,
         )

@@ -51,6 +51,7 @@ from diagnostics.shown import shown
 
 if TYPE_CHECKING:
     from adaptfault.data.calibration import Calibration
+    from diagnostics import Scan
 
 PathName = str | PathLike[str]
 
@@ -106,6 +107,7 @@ class Opened:
         origins: the recordings as their readers give them: which arrays of a data set hold them.
         n_found: number of all recordings, of which these were selected.
         late_problems: warnings about the range of readings, after a whole iteration.
+        scan: of the read-out, of all files; None: there is none.
     """
 
     def __init__(
@@ -117,7 +119,9 @@ class Opened:
         problems: list[Problem],
         values: TargetTable | None,
         n_found: int | None = None,
+        scan: Scan | None = None,
     ) -> None:
+        self.scan = scan
         self._tables = tables
         self.layout = layout
         self.inferred = inferred
@@ -284,6 +288,7 @@ def load(paths: PathName | Iterable[PathName], *, strict: bool = False, **option
         opened.names,
         opened.targets,
         opened.value_names,
+        opened.scan,
     )
     scale = check_scale(given[0], recordings, opened.layout) if strict else []
     told = copies(recordings.frames, recordings.names)
@@ -362,7 +367,8 @@ def open_recordings(
             check_statements(content, known, tables is not None)
 
     usable = _usable(contents, known, check, frames, problems)
-    return Opened(usable, known, inferred, tables, problems, values, n_found)
+    scan = surveyor.scans.of(known, problems)
+    return Opened(usable, known, inferred, tables, problems, values, n_found, scan)
 
 
 def _check_options(
@@ -396,7 +402,9 @@ def _surveyed(
     for file, recordings in listed:
         try:
             with foreseeing(file.path):
-                contents.append(surveyor(file, recordings, problems))
+                content = surveyor(file, recordings, problems)
+                if content is not None:
+                    contents.append(content)
         except InputError as error:
             problems.append(Problem("error", str(error)))
     return contents

@@ -37,6 +37,8 @@ class Block:
         times: float64 ``[t]``, of the clock that the file holds; None where it holds none.
         tick: unit of these times: "s", "ms", "us" or "ns"; None where the file does not state it.
         problems: warnings about these frames.
+        scan: float64 ``[t]``, share of the drive where a frame is of a scan of the read-out; NaN:
+            it is a reading. None: there is no scan.
     """
 
     values: NDArray[Any]
@@ -44,6 +46,7 @@ class Block:
     times: NDArray[np.float64] | None = None
     tick: str | None = None
     problems: tuple[Problem, ...] = ()
+    scan: NDArray[np.float64] | None = None
 
 
 def device_name(stated: object) -> str | None:

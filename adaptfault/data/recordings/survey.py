@@ -17,6 +17,7 @@ from adaptfault.data.recordings.errors import NO_FRAMES, InputError, Problem, fo
 from adaptfault.data.recordings.facts.rates import Elapsed
 from adaptfault.data.recordings.files import Found
 from adaptfault.data.recordings.recording import Block, Facts, Recording, Shape
+from adaptfault.data.recordings.scans import Scans, doubt_of, readings_of, scan_of, without_scan
 from diagnostics import SensorLayout
 from diagnostics.preprocessing.levels import LOW
 from diagnostics.preprocessing.quantiles import known_quantile
@@ -252,17 +253,21 @@ class Surveyor:
         limit: readings above it are counted.
         room: bytes of frames that are kept in memory.
         step: receives the number of frames of each block.
+
+    Attributes:
+        scans: of the read-out, in all files.
     """
 
     def __init__(self, limit: float, room: int, step: Callable[[int], None]) -> None:
         self.limit = limit
         self.room = room
         self.step = step
+        self.scans = Scans()
 
     def __call__(
         self, file: Found, recordings: Sequence[Recording], problems: list[Problem]
-    ) -> Content:
-        """Return the content of a file; warnings are added to ``problems``.
+    ) -> Content | None:
+        """Return the content of a file; None: a scan alone. Warnings are added to ``problems``.
 
         Args:
             file: where it was found.
@@ -275,6 +280,7 @@ class Surveyor:
         """
         surveyed = []
         kept = []
+        scanned = len(self.scans.frames)
         failed: list[InputError] = []
         for recording in recordings:
             try:
@@ -288,6 +294,8 @@ class Surveyor:
         if not kept:
             raise failed[0] if failed else InputError("holds no recordings")
         if not any(survey.length for survey in surveyed):
+            if len(self.scans.frames) > scanned:
+                return None
             raise InputError.at(kept[0].facts.path, NO_FRAMES)
         problems += [Problem("error", str(error)) for error in failed]
         facts = kept[0].facts
@@ -302,9 +310,11 @@ class Surveyor:
         survey = Survey(self.limit)
         blocks: list[Block] | None = []
         size = 0
-        for block in recording.blocks():
+        for given in recording.blocks():
+            problems += (*given.problems, *doubt_of(given, recording.facts.path))
+            self.scans.frames += scan_of(given)
+            block = without_scan(given)
             survey.add(block)
-            problems += block.problems
             size += block.values.nbytes
             self.step(len(block.values))
             if size > self.room:
@@ -313,5 +323,5 @@ class Surveyor:
                 blocks.append(replace(block, problems=()))
         if blocks is not None:
             self.room -= size
-            recording = replace(recording, blocks=partial(iter, blocks))
-        return survey, recording
+            return survey, replace(recording, blocks=partial(iter, blocks))
+        return survey, readings_of(recording)

@@ -54,6 +54,9 @@ _COUNTER = re.compile(
 )
 """Names of what counts the frames, where they stand before the readings."""
 
+SCAN = "scan"
+"""Name of the levels of a scan of the read-out."""
+
 COUNTERS = ("frame_index", "frame_id", "sample_index", "task_index")
 """Names of it wherever they stand."""
 

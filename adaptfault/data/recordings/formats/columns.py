@@ -18,6 +18,7 @@ from adaptfault.data.recordings.facts.rates import TICKS
 from adaptfault.data.recordings.facts.roles import (
     EPISODES,
     LABELS,
+    SCAN,
     clock_of,
     first_of,
     is_clock,
@@ -66,6 +67,7 @@ class Columns:
         unit: of the times, where it is known.
         label: of the class; None without one.
         episode: of the number of the episode; None without one.
+        scan: of the levels of a scan of the read-out; None without one.
         names: of the readings; empty where the file has none.
         shape: ``(pads, rows, cols)`` that the names of the readings show; None: they show none.
         shape_reason: how they show it.
@@ -80,6 +82,7 @@ class Columns:
     unit: str | None = None
     label: int | None = None
     episode: int | None = None
+    scan: int | None = None
     names: tuple[str, ...] = ()
     shape: Shape | None = None
     shape_reason: str = ""
@@ -90,8 +93,8 @@ class Columns:
     @property
     def used(self) -> list[int]:
         """The columns of numbers that are read, in the order of the file."""
-        clock = () if self.clock is None else (self.clock,)
-        return sorted({*self.readings, *clock})
+        aside = {column for column in (self.clock, self.scan) if column is not None}
+        return sorted({*self.readings, *aside})
 
 
 def choose_columns(
@@ -121,7 +124,7 @@ def choose_columns(
     ignored = set() if ignore is None else set(table.several("ignore", ignore))
     wanted = None if columns is None else table.several("columns", columns)
     roles = _by_names(table, {*ignored, *(wanted or ())}, time_column, label_column)
-    aside = {*no_readings(table.names), roles.clock, roles.label, roles.episode}
+    aside = {*no_readings(table.names), roles.clock, roles.label, roles.episode, roles.scan}
     readings = [i for i in range(dialect.width) if i not in aside] if wanted is None else wanted
     inferred: tuple[str, ...] = ()
     problems: tuple[Problem, ...] = ()
@@ -131,7 +134,7 @@ def choose_columns(
         if ticks is not None:
             roles = replace(roles, clock=0, unit=ticks or None)
             problems = (Problem.warning(path, _TAKEN),)
-    aside = {*ignored, roles.clock, roles.label, roles.episode}
+    aside = {*ignored, roles.clock, roles.label, roles.episode, roles.scan}
     readings = [i for i in readings if i not in aside]
     if wanted is None:
         readings, inferred = _numbered(table.names, readings, shape)
@@ -143,7 +146,7 @@ def choose_columns(
         )
     names = tuple(table.names[i] for i in readings) if table.names else ()
     shown = shape_of(names) if shape is None and names else None
-    others = set(range(dialect.width)) - {*readings, roles.clock}
+    others = set(range(dialect.width)) - {*readings, roles.clock, roles.scan}
     return replace(
         roles,
         readings=tuple(readings),
@@ -172,7 +175,9 @@ def _by_names(
     if label_column is not None:
         label = table.one("label-column", label_column)
     unit = None if clock is None or not table.names else unit_of(table.names[clock])
-    return Columns(table.width, (), clock, unit, label, _at(free, first_of(EPISODES, free)))
+    episode = _at(free, first_of(EPISODES, free))
+    scan = _at(free, first_of((SCAN,), free))
+    return Columns(table.width, (), clock, unit, label, episode, scan)
 
 
 def _at(names: Sequence[str], name: str | None) -> int | None:

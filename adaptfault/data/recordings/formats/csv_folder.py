@@ -224,12 +224,15 @@ def _parse(path: Path, data: bytes, before: _Before, dialect: Dialect, columns: 
     values = parse_rows(path, rows, lines.tolist(), dialect, columns, kind)
     used = columns.used
     times = None if clock is None else values[:, used.index(clock)].astype(np.float64)
+    scan = None
+    if columns.scan is not None:
+        scan = values[:, used.index(columns.scan)].astype(np.float64)
     if used != list(columns.readings):
         values = values[:, [used.index(column) for column in columns.readings]]
     # a reading that float32 cannot hold becomes infinite, and is missing
     with np.errstate(all="ignore"):
         readings = values.astype(np.float32, copy=False)
-    return Block(readings, lines, times, unit, problems)
+    return Block(readings, lines, times, unit, problems, scan)
 
 
 def _in_seconds(row: str, column: int, dialect: Dialect) -> str:

@@ -23,6 +23,7 @@ from adaptfault.data.atomic import atomic_write
 from adaptfault.data.printable import printable
 from adaptfault.data.recordings.dataset import Recordings
 from adaptfault.data.recordings.errors import InputError, Problem
+from adaptfault.data.recordings.facts.roles import SCAN
 from adaptfault.data.recordings.facts.sizes import check_archive, check_array
 from adaptfault.data.recordings.formats.datasets.beside import Stated
 from adaptfault.data.recordings.formats.datasets.contents import Contents, Opened, texts
@@ -30,6 +31,7 @@ from adaptfault.data.recordings.formats.datasets.features import Pads
 from adaptfault.data.recordings.formats.datasets.reader import recordings_of
 from adaptfault.data.recordings.formats.text import read_bytes, read_json_object, shown
 from adaptfault.data.recordings.recording import DECLARED, Facts, Recording, Shape
+from adaptfault.data.recordings.scans import levels_of, with_levels
 
 SUFFIXES = (".npz",)
 
@@ -46,6 +48,7 @@ _KEYS = (
     "unit",
     "layout",
     "device",
+    "scan",
 )
 _RATES = ("sampling_hz", "rate", "rate_hz", "rate_Hz")  # in the JSON file beside an archive
 _BITS = re.compile(r"\s*(\d{1,2})[ -]?bits?\b", re.ASCII)
@@ -71,6 +74,9 @@ def open(path: Path, *, shape: Shape | None = None, **stated: Any) -> list[Recor
     ``device`` as in a layout file). A JSON file of the same stem may give ``class_names`` (or
     ``classes``), ``sampling_hz`` (or ``rate``), ``full_scale`` (a number, or "12 bit") and
     ``unit``; the archive itself takes precedence.
+
+    An array ``scan`` says which frames are of a scan of the read-out
+    (:mod:`adaptfault.data.recordings.scans`).
 
     Args:
         path: the archive.
@@ -117,7 +123,26 @@ def open(path: Path, *, shape: Shape | None = None, **stated: Any) -> list[Recor
     )
     classes = labels or [None] * len(recordings)
     each = zip(recordings, names, classes, strict=True)
-    return [replace(one, facts=facts, name=name, label=label) for one, name, label in each]
+    found = [replace(one, facts=facts, name=name, label=label) for one, name, label in each]
+    return _with_scan(path, arrays, found)
+
+
+def _with_scan(
+    path: Path, arrays: Mapping[str, NDArray[Any]], recordings: list[Recording]
+) -> list[Recording]:
+    """Return the recordings with the levels of their frames, where the archive has an array
+    ``scan``: ``[n, T]``, or ``[T]`` or ``[sum of lengths]``, NaN where a frame is a reading."""
+    if SCAN not in arrays:
+        return recordings
+    scan = arrays[SCAN]
+    frames = arrays[_FRAMES]
+    stacked = scan.ndim == 2 and scan.shape == frames.shape[:2]
+    if scan.dtype.kind not in "iuf" or not (stacked or scan.shape == frames.shape[:1]):
+        what = f"array 'scan' is {scan.dtype} {list(scan.shape)}; expected one number a frame"
+        raise InputError.at(path, f"{what} of {list(frames.shape)}, NaN where it is a reading")
+    lengths = arrays["lengths"].tolist() if "lengths" in arrays else None
+    levels = scan.astype(np.float64)
+    return [with_levels(one, levels_of(levels, lengths, i)) for i, one in enumerate(recordings)]
 
 
 def array_recordings(path: Path, opened: Opened, shape: Shape | None) -> list[Recording]:

@@ -33,6 +33,7 @@ class Frame:
         values: float64 ``[D]``, NaN = missing reading.
         lost: number of frames missing before this one.
         restarted: the device's clock restarted with this frame.
+        scan: share of the drive in a frame of a scan; None: an ordinary frame.
     """
 
     device: str
@@ -40,6 +41,7 @@ class Frame:
     values: NDArray[np.float64]
     lost: int = 0
     restarted: bool = False
+    scan: float | None = None
 
 
 @dataclass(frozen=True)
@@ -216,4 +218,6 @@ class Ordering:
         self._seen.append(one.time)
         self._lost += lost
         self._kept += 1
-        return Frame(self.device, one.time + self._offset, one.packet.values, lost, restarted)
+        packet = one.packet
+        at = one.time + self._offset
+        return Frame(self.device, at, packet.values, lost, restarted, packet.scan)

@@ -1,5 +1,10 @@
 """The paper's UDP packets, ``device_id,timestamp,220 values`` as CSV text (Section II): parsing and
-formatting."""
+formatting.
+
+Version 2 has one field more where the frame is one of a scan, ``device_id,timestamp,scan=LEVEL,
+values``: the share of the drive, 0 to 1, 0 where the lines are let go. Its values are shares of the
+converter's range, 0 to 1. All other packets are those of version 1.
+"""
 
 from __future__ import annotations
 
@@ -27,6 +32,7 @@ _LATEST = 1e19  # ticks; nanoseconds since 1970 fit
 _VALUE_BYTES = 32  # a double written in full, and its comma
 
 
+_SCAN = "scan="
 _TAG = 16  # bytes of the HMAC, written as twice as many hexadecimal digits
 _SHORTEST_KEY = 16  # bytes
 
@@ -49,12 +55,15 @@ class Packet:
         values: float64 ``[D]`` in the sender's unit; NaN = missing reading.
         restored: cells whose value was written with a plus sign: ``adaptfault listen --relay``
             restored them.
+        scan: share of the drive in a frame of a scan, whose values are shares of the converter's
+            range; None: an ordinary frame.
     """
 
     device: str
     time: float
     values: NDArray[np.float64]
     restored: tuple[int, ...] = ()
+    scan: float | None = None
 
 
 def longest_packet(n_cells: int) -> int:
@@ -112,6 +121,9 @@ def parse_packet(
     except UnicodeDecodeError:
         raise PacketError("not ASCII text; expected device_id,timestamp,values") from None
     device, stamp, *values = [*text.split(","), ""] if "," not in text else text.split(",")
+    scan = None
+    if values and values[0].startswith(_SCAN):
+        scan = _level(values.pop(0))
     if len(values) == n_cells + 1 and not values[-1]:
         values.pop()
     if len(values) != n_cells:
@@ -129,7 +141,7 @@ def parse_packet(
     restored = (
         tuple(i for i, value in enumerate(values) if value.startswith("+")) if "+" in text else ()
     )
-    return Packet(device, time / ticks, frame, restored)
+    return Packet(device, time / ticks, frame, restored, scan)
 
 
 def format_packet(
@@ -141,6 +153,7 @@ def format_packet(
     restored: ArrayLike | None = None,
     digits: int = 6,
     key: bytes | None = None,
+    scan: float | None = None,
 ) -> bytes:
     """Write the packet that :func:`parse_packet` reads; the time stamp is a whole number of ticks.
 
@@ -153,22 +166,34 @@ def format_packet(
             ignore.
         digits: significant digits of a value that is not restored; restored ones have 6.
         key: of the authentication code that the packet ends with; None: no code.
+        scan: share of the drive in a frame of a scan; None: an ordinary frame.
 
     Raises:
-        ValueError: :func:`parse_packet` would reject the device name.
+        ValueError: :func:`parse_packet` would reject the device name, or the share.
     """
+    if scan is not None and not 0 <= scan <= 1:
+        raise ValueError(f"scan={scan}: expected the share of the drive, 0 to 1")
     if DEVICE.fullmatch(device) is None:
         raise ValueError(f"device {device!r}; expected letters, digits and . _ : - (64 at most)")
     numbers = np.asarray(values, dtype=np.float64).ravel().tolist()
     written = ["" if value != value else f"{value:.{digits}g}" for value in numbers]
     for i in () if restored is None else np.flatnonzero(restored).tolist():
         written[i] = f"{numbers[i]:+.6g}"
-    data = f"{device},{round(time * ticks)},{','.join(written)}".encode()
+    level = "" if scan is None else f"{_SCAN}{scan:.9g},"
+    data = f"{device},{round(time * ticks)},{level}{','.join(written)}".encode()
     return data if key is None else data + b"*" + _code(data, key)
 
 
 def _code(data: bytes, key: bytes) -> bytes:
     return hmac.new(key, data, hashlib.sha256).digest()[:_TAG].hex().encode()
+
+
+def _level(text: str) -> float:
+    """Return the share of the drive that a field states; raise PacketError for another one."""
+    level = _number(text.removeprefix(_SCAN))
+    if not 0 <= level <= 1:
+        raise PacketError(f"{text[:20]!r}; expected the share of the drive, scan=0 to scan=1")
+    return level
 
 
 def _number(text: str) -> float:

@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from adaptfault.data.atomic import atomic_write, make_folder, sync
 from adaptfault.data.recordings.facts.layout_file import read_layout
-from diagnostics import SensorLayout
+from diagnostics import Scan, SensorLayout
 
 INTERVAL = 1.0
 """Seconds between two syncs to the disk: the most that a power cut loses."""
@@ -146,6 +146,20 @@ class Recorder:
             self._settle()
             os.fsync(file.fileno())
         return Recorded(self._path, self._frames, self._last - self._first + 1 / self.layout.rate)
+
+    def write_scan(self, scan: Scan) -> Path:
+        """Write a scan of the read-out into a file of its own: a column ``scan``, and one a cell.
+
+        Raises:
+            OSError: the file cannot be written.
+        """
+        began = datetime.now(timezone.utc)
+        stem = f"{self.device.replace(':', '-')}_{began:%Y%m%dT%H%M%S_%f}_scan.csv"
+        names = [f"c{i}" for i in range(scan.readings.shape[1])]
+        rows = np.column_stack([scan.levels, scan.readings])
+        text = ",".join(["scan", *names]) + "\n" + "".join(map(_line, rows))
+        atomic_write(self.folder / stem, text.encode("ascii"))
+        return self.folder / stem
 
     def __enter__(self) -> Recorder:
         return self

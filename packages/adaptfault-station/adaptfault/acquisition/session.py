@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 
 from adaptfault.acquisition.ordering import Frame
 from adaptfault.acquisition.recorder import Recorded, Recorder
+from adaptfault.acquisition.scanning import Scans
 from adaptfault.acquisition.switch import Contact, Rule, Switch
-from diagnostics import Diagnosis, Fault, FaultSet, Monitor, SensorLayout
+from diagnostics import Diagnosis, Fault, FaultSet, Monitor, ReadOut, SensorLayout
 
 CONFIRMED_AFTER = 100
 """Number of predicted windows after which a version on probation is confirmed."""
@@ -59,7 +60,7 @@ class Event:
 
     Attributes:
         kind: "fault" (new or changed), "gone", "class", "recording", "recorded", "restart",
-            "silent", "confirmed" or "trouble".
+            "scan", "silent", "confirmed" or "trouble".
         device: name of the device.
         time: seconds, as in :class:`Frame`.
         text: one sentence.
@@ -107,6 +108,7 @@ class Session:
         clock: returns the local time.
         accumulate: tell the class of the whole contact so far, which the watcher accumulates, and
             not that of the last window. Every contact is decided anew.
+        scans: collects the frames of scans; None: they are left out.
 
     Where the watcher gives the set of classes of a window, the event of a class tells it, and comes
     whenever the class or the set changes.
@@ -121,8 +123,10 @@ class Session:
         rule: Rule | None = None,
         clock: Callable[[], datetime] = datetime.now,
         accumulate: bool = False,
+        scans: Scans | None = None,
     ) -> None:
         self.device = device
+        self.scans = scans
         self.watcher = watcher
         self.recorder = recorder
         self.clock = clock
@@ -153,11 +157,18 @@ class Session:
         self.time = frame.time
         self._arrived = now
         events = [self._event("restart", "the device restarted")] if frame.restarted else []
+        if frame.scan is not None:
+            if self.scans is not None:
+                self.scans.add(frame)
+            return events
+        if self.scans is not None:
+            events += self._scanned(self.scans, self.scans.pass_by(frame))
+        at = frame.time - (0.0 if self.scans is None else self.scans.time)
         if isinstance(self.watcher, Monitor):
-            news = self.watcher.update(frame.values, frame.time)
+            news = self.watcher.update(frame.values, at)
             self.faults = self.watcher.faults
         else:
-            reading = self.watcher.stream(frame.values, frame.time)
+            reading = self.watcher.stream(frame.values, at)
             news = tuple(reading.events)
             self.faults = reading.faults
             events += self._classify(reading)
@@ -173,13 +184,18 @@ class Session:
         if self._arrived is None or now - self._arrived < SILENCE:
             return []
         self._arrived = None
-        return [self._event("silent", f"no frame for {SILENCE:g} s"), *self.close()]
+        silent = self._event("silent", f"no frame for {SILENCE:g} s")
+        return [silent, *self._end_scan(), *self.close()]
 
     def command(self, record: bool | None) -> list[Event]:
         """Record from now on (True), do not record (False), or follow the rule (None)."""
         if self.switch is not None:
             self.switch.command = record
         return [] if record else self.close()
+
+    def finish(self) -> list[Event]:
+        """End: no frame comes any more."""
+        return [*self._end_scan(), *self.close()]
 
     def close(self) -> list[Event]:
         """End the recording, if one is open."""
@@ -190,6 +206,37 @@ class Session:
         except OSError as error:
             return [self._trouble(error)]
         return [] if recorded is None else [self._recorded(recorded)]
+
+    def _end_scan(self) -> list[Event]:
+        """End a scan, if there is one."""
+        return [] if self.scans is None else self._scanned(self.scans, self.scans.end())
+
+    def _scanned(self, scans: Scans, found: ReadOut | None) -> list[Event]:
+        """Return what a scan says that has ended; None: none has."""
+        if found is None:
+            return []
+        told = found.faults
+        tested = int((found.alive | found.broken).sum())
+        data = {
+            "faults": [fault.to_dict() for fault in told],
+            "tested": tested,
+            "under_load": found.under_load,
+            "incomplete": found.incomplete,
+        }
+        events = [self._event("scan", found.summary, **data)]
+        if self._faulty is None:
+            self._faulty = np.zeros(found.alive.size, bool)
+        for fault in told:
+            if not self._faulty[list(fault.cells)].all():
+                events.append(self._fault_event(fault))
+            self._faulty[list(fault.cells)] = True
+        if self.recorder is not None and scans.last is not None:
+            try:
+                path = self.recorder.write_scan(scans.last)
+            except OSError as error:
+                return [*events, self._trouble(error)]
+            events.append(self._event("recorded", f"{path}: a scan", path=str(path)))
+        return events
 
     def _classify(self, reading: StreamResult) -> list[Event]:
         values = getattr(reading, "values", None)  # of a regression: no label, and no event

@@ -23,6 +23,7 @@ from adaptfault.acquisition.packet import TICKS
 from adaptfault.acquisition.receiver import Receiver
 from adaptfault.acquisition.recorder import Recorder
 from adaptfault.acquisition.relay import FrameRepair, Relay, parse_address
+from adaptfault.acquisition.scanning import Scans
 from adaptfault.acquisition.session import Event, Session, StreamingPredictor
 from adaptfault.acquisition.switch import Rule, parse_when
 from adaptfault.data.printable import printable
@@ -197,7 +198,7 @@ class Station:
             self.receiver.discard()  # what the number of frames left over
         finally:
             for session in self._sessions.values():
-                self._emit(session.close())
+                self._emit(session.finish())
             if self._relay is not None:
                 self._relay.close()
             self._close_view()
@@ -253,10 +254,13 @@ class Station:
     def _forget(self, devices: Collection[str]) -> None:
         """End the sessions of devices that the receiver has forgotten."""
         for gone in devices:
-            self._emit(self._sessions.pop(gone).close())
+            self._emit(self._sessions.pop(gone).finish())
             self._show(gone, methodcaller("forget", gone))
 
     def _process(self, session: Session, frame: Frame) -> None:
+        if frame.scan is not None:
+            self._emit(session.take(frame, time.monotonic()))
+            return
         frame, outside = self._in_unit(frame)
         self._outside += outside
         events = session.take(frame, time.monotonic())
@@ -317,6 +321,8 @@ class Station:
     def _send(self, frame: Frame) -> None:
         """Send a frame on, before it waits for monitoring and classification, which take longer."""
         assert self._relay is not None  # for the type checker
+        if frame.scan is not None:
+            return  # no readings
         session = self._sessions.get(frame.device)
         watcher = self._first if session is None else session.watcher
         whole, _ = self._in_unit(frame)
@@ -336,7 +342,12 @@ class Station:
     def _begin(self, device: str) -> Session:
         recorder = None if self.record is None else Recorder(self.record, self.layout, device)
         session = Session(
-            device, self._watcher(), recorder=recorder, rule=self._rule, accumulate=self.accumulate
+            device,
+            self._watcher(),
+            recorder=recorder,
+            rule=self._rule,
+            accumulate=self.accumulate,
+            scans=Scans(self.layout),
         )
         session.command(self._command)
         return session

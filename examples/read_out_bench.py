@@ -1,0 +1,113 @@
+"""How many open and shorted crossings and lines a scan of the read-out finds with nobody touching,
+on the circuit of an array.
+
+    python examples/read_out_bench.py [--arrays 200] [--small]
+
+Each array has two open crossings, a shorted one of up to 1 kiloohm, and every second one a row or
+column that is cut somewhere. Preload, leakage to ground (1 megaohm to 1 gigaohm) and the noise of
+the converter (12 bits) differ from array to array.
+"""
+
+import argparse
+from collections import Counter
+
+import numpy as np
+
+from diagnostics import Line, SensorLayout, judge_scan
+from diagnostics.evidence.read_out import ReadOut
+from diagnostics.simulation.circuit import Circuit, CutLine, ShortedLine, StuckCell
+from diagnostics.simulation.scan import scan_circuit
+
+SIZES = ((16, 16), (11, 10))
+READ_OUTS = {"grounded": 100.0, "virtual ground": 1.0}  # ohms of the divider
+PRELOAD = 0.02  # newton at most, of 5
+
+
+def scanned(circuit: Circuit, rng: np.random.Generator) -> ReadOut:
+    """Return what a scan says of an untouched array."""
+    layout = circuit.layout
+    idle = rng.uniform(0, PRELOAD, layout.n_cells)
+    noise = float(rng.choice([0.5, 1.0, 2.0]))
+    scan = scan_circuit(circuit, idle, noise=noise, seed=int(rng.integers(1 << 30)))
+    return judge_scan(scan, layout)
+
+
+def broken(layout: SensorLayout, rng: np.random.Generator, *, cut: bool) -> tuple:
+    """Return faults of a netlist, and which crossings are open and shorted, bool ``[D]``."""
+    first, second, third = rng.choice(layout.n_cells, 3, replace=False).tolist()
+    ohms = float(rng.choice([0.0, rng.uniform(0, 1000)]))
+    faults = [StuckCell(first, np.inf), StuckCell(second, np.inf), StuckCell(third, ohms)]
+    is_open = np.isin(np.arange(layout.n_cells), [first, second])
+    is_short = np.arange(layout.n_cells) == third
+    if cut:
+        line = [one for one in layout.lines if one.kind in ("row", "column")]
+        line = line[rng.integers(len(line))]
+        before = int(rng.integers(len(layout.cells_on(line)) - 2))
+        faults.append(CutLine(line, before))
+        beyond = layout.cells_on(line)[before:]
+        is_open[beyond] = True
+        is_short[beyond] = False
+    return tuple(faults), is_open, is_short
+
+
+def crossings(layout: SensorLayout, load: float, arrays: int) -> Counter:
+    """Return counts of crossings over many arrays."""
+    rng = np.random.default_rng(0)
+    count: Counter = Counter()
+    for i in range(arrays):
+        faults, is_open, is_short = broken(layout, rng, cut=i % 2 == 0)
+        leak = 10 ** rng.uniform(6, 9)
+        found = scanned(Circuit(layout, faults=faults, load_ohms=load, leak_ohms=leak), rng)
+        told = np.isin(np.arange(layout.n_cells), [c for f in found.faults for c in f.cells])
+        healthy = ~is_open & ~is_short
+        count["open"] += int(is_open.sum())
+        count["open found"] += int((told & is_open).sum())
+        count["short"] += int(is_short.sum())
+        count["short found"] += int((told & is_short).sum())
+        count["blamed"] += int((told & healthy).sum())
+        count["untested"] += int((~found.alive & ~told).sum())
+        count["cells"] += layout.n_cells
+    return count
+
+
+def lines(layout: SensorLayout, load: float, arrays: int) -> list[str]:
+    """Return how often a whole line that fails is named, and how many other cells are blamed."""
+    told = []
+    for what in ("floating", "on ground", "on the supply"):
+        rng = np.random.default_rng(1)
+        named = blamed = 0
+        for i in range(arrays):
+            kind = "column" if i % 2 else "row"
+            size = layout.cols if kind == "column" else layout.rows
+            line = Line(0, kind, int(rng.integers(size)))
+            fault = CutLine(line) if what == "floating" else ShortedLine(line, what.split()[-1])
+            found = scanned(Circuit(layout, faults=(fault,), load_ohms=load), rng)
+            named += any(one.line == line for one in found.faults)
+            others = {c for one in found.faults for c in one.cells}
+            blamed += len(others - set(layout.cells_on(line).tolist()))
+        told.append(f"{what}: {named} of {arrays} named, {blamed} other cells blamed")
+    return told
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--arrays", type=int, default=200)
+    parser.add_argument("--small", action="store_true", help="4 arrays")
+    args = parser.parse_args()
+    arrays = 4 if args.small else args.arrays
+    for rows, cols in SIZES:
+        layout = SensorLayout(1, rows, cols)
+        for name, load in READ_OUTS.items():
+            count = crossings(layout, load, arrays)
+            print(
+                f"{rows} x {cols}, {name}, {arrays} arrays: open"
+                f" {count['open found']}/{count['open']}, short"
+                f" {count['short found']}/{count['short']}, healthy blamed {count['blamed']},"
+                f" untested {count['untested']} of {count['cells']} cells"
+            )
+            for text in lines(layout, load, max(arrays // 10, 4)):
+                print(f"    line {text}")
+
+
+if __name__ == "__main__":
+    main()

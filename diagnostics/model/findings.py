@@ -78,8 +78,8 @@ def _reads_the_same_loads(alias: Fault, log: Log) -> bool:
     loaded = (log.load[:, cells] > NOTHING) & ~log.disturbed[cells]
     if len(cells) == 2 or not loaded[since].any():
         return False
-    moves = np.median(np.ptp(log.record.mean[since][:, cells], axis=0))
-    alone = np.median(np.ptp(log.above[since][:, cells], axis=0))
+    moves = np.ptp(log.record.mean[since][:, cells], axis=0).sum()
+    alone = np.ptp(log.above[since][:, cells], axis=0).sum()
     return bool(alone > _ALONE * moves)
 
 

@@ -51,7 +51,8 @@ _MEDIAN = 5  # of them, those that tell where its pad does
 _QUIET = 0.1  # quantile of the changes between two pieces: a cell that no load moves
 _QUIETEST = 0.25  # of the cells of a pad: noise is what all have
 _OF_DEVIATION = 0.178  # this quantile of a normal deviate's changes
-_USUALLY = 0.95  # of the pieces
+_USUALLY = 0.95  # of the pieces of the reference
+_OFTEN = 0.9  # of those of a log
 _NOISIER = 2.0  # times as noisy, or coarse, as the reference
 _UNSEEN = 1.5  # times what the reference usually shows: it never saw as much
 _FEWEST_STEPS = 3  # between the readings of a cell that has steps
@@ -85,6 +86,7 @@ class Rest:
         near: ``[D]``, readings this far above or below it are no load.
         full: highest reading that the reference shows, or full scale.
         high: ``[D]``, highest reading of each cell in the reference.
+        low: ``[D]``, lowest one above its rest.
         pad: int ``[D]``, pad of each cell.
         share: ``[D]``, of what its pad shares that each cell shows.
         noise: ``[D]``, how far each cell reads from rest in the reference by noise.
@@ -100,6 +102,7 @@ class Rest:
     near: Array
     full: float
     high: Array
+    low: Array
     pad: Cells
     share: Array
     noise: Array
@@ -122,7 +125,8 @@ class Rest:
         of_pads = self.of_pads(record, telling, drift)
         share = _share(record.mean - self.level - drift, of_pads, self.near, self.share)
         # what the reference shows tells more, unless it never saw as much
-        unseen = _usually(of_pads) > _UNSEEN * self.offsets
+        often = np.quantile(np.abs(of_pads), _OFTEN, axis=0)
+        unseen = often > _UNSEEN * self.offsets
         share = np.where(unseen, share, self.share).astype(np.float32)
         unseen |= (drift != 0).mean(axis=0) > _LASTS
         return Shared(drift, drift + share * of_pads, unseen)
@@ -173,11 +177,15 @@ class Rest:
         first = _blocks(record)
         if len(first) < _AROUND:
             return found
-        lowest = np.fmin.reduceat(record.mean - self.level, first, axis=0)
+        above = record.mean - self.level
+        # what stays at an end of the converter is no rest
+        at_end = (record.high <= 0) | (record.low >= self.full * (1 - DITHER))
+        live = telling & self.settles & ~at_end.all(axis=0)
+        lowest = np.fmin.reduceat(above, first, axis=0)
         of_block = np.zeros_like(lowest)
         for pad in np.unique(self.pad).tolist():
             cells = np.flatnonzero((self.pad == pad) & np.isfinite(lowest).all(axis=0))
-            tell = (telling & self.settles)[cells]
+            tell = live[cells]
             if tell.sum() < _FEWEST:
                 continue
             low = lowest[:, cells]
@@ -305,7 +313,7 @@ def fit_rest(record: Record, full: float, step: float, pad: Cells, living: Mask)
     none = np.zeros_like(usual)
     most = np.full_like(usual, np.inf)
     high = np.fmax.reduce(record.high)
-    rest = Rest(none, none, full, high, pad, usual, none, most, most, every, every, step)
+    rest = Rest(none, none, full, high, none, pad, usual, none, most, most, every, every, step)
     least = rest.least
     level, _ = _lowest(record.mean, first, least)
     noise = rest.noise_of(record, record.mean, living)
@@ -334,7 +342,8 @@ def fit_rest(record: Record, full: float, step: float, pad: Cells, living: Mask)
     at_top = rest.share_at_top(record, above, living)
     offsets = np.maximum(np.maximum(near, DITHER * full), _usually(rest.of_pads(record, living)))
     drifts = _usually(replace(rest, drifts=none).drift(record, living))
-    return replace(rest, noise=noise, offsets=offsets, drifts=drifts, at_top=at_top)
+    low = np.nan_to_num(np.fmin.reduce(above))
+    return replace(rest, low=low, noise=noise, offsets=offsets, drifts=drifts, at_top=at_top)
 
 
 def _usually(values: Array) -> Array:

@@ -76,7 +76,8 @@ class Symbols:
         """Return the level of each piece, ``[n, D]``."""
         level = np.searchsorted(self.edges, root_load(above, self.rest), "right").astype(np.int8)
         level[record.mean >= self.rest.full - self.tolerance] = self.top
-        level[above < -np.maximum(self.rest.near, DITHER * self.rest.full)] = self.top + 1
+        lowest = np.minimum(self.rest.low - DITHER * self.rest.full, -self.rest.near)
+        level[above < lowest] = self.top + 1
         return level
 
     def flat(self, record: Record) -> NDArray[np.int8]:

@@ -137,7 +137,7 @@ def fit_model(
     above = rest.above(record, rest.shared(record, living).offset)
     symbols = Symbols.fit(above, rest, living)
     load = root_load(above, rest)
-    level = symbols.levels(record, above)
+    level = symbols.levels(record, above, np.zeros(above.shape, bool))
     flat = symbols.flat(record)
     fold = rng.permutation(len(recordings)) % min(_FOLDS, len(recordings))
     means = [

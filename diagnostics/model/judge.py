@@ -243,7 +243,8 @@ class Model:
         only_held = disturbed | ~self.living
         counts = _counting(evidence, WAYS, only_held)
         log_odds = logit(_PREVALENCE) + _of_any(counts, WAYS)
-        if self._odd_as_a_whole(observed, log_odds > 0, log.far & ~failing.cells):
+        alone = log.far & ~failing.cells
+        if self._odd_as_a_whole(observed, alone & (log_odds > 0) & _moves(counts), alone):
             disturbed = np.ones_like(disturbed)
             only_held = disturbed
             counts = _counting(evidence, WAYS, only_held)
@@ -364,14 +365,21 @@ class Model:
         return found
 
     @staticmethod
-    def _odd_as_a_whole(observed: Observed, suspect: Mask, alone: Mask) -> bool:
-        """Return whether many of the cells that move ``alone`` are ``suspect``, bool ``[D]`` each,
-        or trusted ones odd in many units."""
-        refuted = alone & (observed.log.run < HELD) & suspect
+    def _odd_as_a_whole(observed: Observed, refuted: Mask, alone: Mask) -> bool:
+        """Return whether many of the cells that move ``alone`` are ``refuted``, bool ``[D]``
+        each, or whether trusted ones odd in many units."""
         if refuted.sum() >= _FEWEST and refuted.sum() > _DISTURBED * alone.sum():
             return True
         odd = observed.odd[:, observed.known].mean(axis=0)
         return len(odd) >= _FEWEST and bool(np.quantile(odd, _MOST_CELLS) > _STRANGE * USUAL)
+
+
+def _moves(evidence: Array) -> Mask:
+    """Return the cells of which a way to move tells more than a held value, bool ``[D]``;
+    ``evidence``: ``[ways, D]``."""
+    holds = np.array([way.kind is None for way in WAYS])
+    found: Mask = evidence[~holds].max(axis=0) > evidence[holds].max(axis=0)
+    return found
 
 
 def _counting(evidence: Array, ways: Sequence[Way], disturbed: Mask) -> Array:

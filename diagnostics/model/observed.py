@@ -73,16 +73,6 @@ class Log:
         if self.step or self.saturated:
             self.disturbed = np.ones_like(self.disturbed)
         self.above = np.where(wider & (np.abs(self.above) <= unsure), 0, self.above)
-        self.load = root_load(self.above, rest)
-        doubt = np.where(wider, unsure, rest.near / 2)
-        shifts = [np.zeros_like(doubt), -doubt, doubt]
-        if wider.any():
-            shifts += [-doubt / 2, doubt / 2]
-        self.either = np.stack([symbols.levels(record, self.above + shift) for shift in shifts])
-        self.level: NDArray[np.int8] = self.either[0]
-        self.agree = np.log(symbols.agree(self.step))[self.level]
-        self.flat = symbols.flat(record)
-        self.before = before_of(self.flat, record)
         self.value = _held(record.mean, DITHER * rest.full)
         # beyond the range of the reference every reading is the top
         top = rest.full - symbols.tolerance
@@ -90,6 +80,18 @@ class Log:
         low = np.where(saturates, top, self.value - symbols.tolerance)
         high = np.where(saturates, np.inf, self.value + symbols.tolerance)
         self.holds = (record.low >= low) & (record.high <= high)
+        self.load = root_load(self.above, rest)
+        doubt = np.where(wider, unsure, rest.near / 2)
+        shifts = [np.zeros_like(doubt), -doubt, doubt]
+        if wider.any():
+            shifts += [-doubt / 2, doubt / 2]
+        self.either = np.stack(
+            [symbols.levels(record, self.above + shift, self.holds) for shift in shifts]
+        )
+        self.level: NDArray[np.int8] = self.either[0]
+        self.agree = np.log(symbols.agree(self.step))[self.level]
+        self.flat = symbols.flat(record)
+        self.before = before_of(self.flat, record)
         self._alone: Array | None = None
         ends_at_top = self.level[-1] == symbols.top
         self.overloaded: Mask = self.far & ends_at_top & self.saturated

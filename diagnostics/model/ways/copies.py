@@ -17,19 +17,19 @@ from diagnostics.model.record import Array, Cells
 from diagnostics.model.ways.way import MISS, Way
 
 
-def _of(observed: Observed, units: Units, source: Array, given: Array) -> Array:
+def _of(observed: Observed, units: Units, source: Array, above: Array, given: Array) -> Array:
     """Return the evidence ``[D]`` that each cell repeats a source.
 
     Args:
         observed: the log.
         units: of it.
         source: readings ``[n, D]``; NaN: none.
+        above: how far it reads above its rest, ``[n, D]``.
         given: log P(observed level) of the source, ``[n, D]``.
     """
     log = observed.log
-    rest = log.symbols.rest
     away = np.abs(log.record.mean - source)
-    loaded = (log.level > 0) | (source - rest.level > rest.near)
+    loaded = (log.level > 0) | (above > log.symbols.rest.near)
     same = np.log(1 - MISS) - log.agree - observed.of_level
     ratio = np.where(away <= log.symbols.tolerance, same, np.log(MISS))
     told = loaded & observed.tells & np.isfinite(source)
@@ -47,21 +47,29 @@ def _each(observed: Observed, units: Units) -> tuple[Array, Cells]:
     beside = observed.predictor.beside
     known = observed.known
     read = observed.log.record.mean
+    loads = observed.log.above
     found = []
     sources = []
     for other in beside.T:
         there = (other >= 0) & known[other]
         source = np.where(there, read[:, other], np.nan)
-        found.append(_of(observed, units, source, observed.of_level[:, other]))
+        given = observed.of_level[:, other]
+        found.append(_of(observed, units, source, loads[:, other], given))
         sources.append(np.where(there, other, -1))
-    there = beside >= 0
-    around = np.where(there, read[:, beside], 0).sum(axis=2)
-    count = there.sum(axis=1)
-    mean = np.where(count > 1, around / np.maximum(count, 1), np.nan)
     certain = np.zeros_like(observed.of_level)
-    found.append(_of(observed, units, mean, certain))
+    found.append(_of(observed, units, _around(read, beside), _around(loads, beside), certain))
     sources.append(np.full(len(known), -1))
     return np.stack(found), np.stack(sources)
+
+
+def _around(values: Array, beside: Cells) -> Array:
+    """Return the mean of the values ``[n, D]`` of the cells beside each one; NaN: of fewer than
+    two."""
+    there = beside >= 0
+    count = there.sum(axis=1)
+    total = np.where(there, values[:, beside], 0).sum(axis=2)
+    found: Array = np.where(count > 1, total / np.maximum(count, 1), np.nan)
+    return found
 
 
 def _evidence(observed: Observed, units: Units) -> Array:

@@ -41,7 +41,7 @@ def _ratio(observed: Observed) -> Array:
     without = log.above - offset
     own = root_load(without, symbols.rest)
     levels = observed.predictor(log.load, own, log.record.first, observed.known)
-    level = symbols.levels(log.record, without).astype(np.intp)
+    level = symbols.levels(log.record, without, log.holds).astype(np.intp)
     likely = np.log(np.take_along_axis(levels, level[..., None], 2)[..., 0])
     moved = offset > symbols.rest.near
     ratio = np.where(moved & ~observed.unwitnessed, likely - observed.of_level, 0)

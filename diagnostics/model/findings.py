@@ -25,7 +25,7 @@ from diagnostics.model.ways.comes_and_goes import COMES_AND_GOES
 from diagnostics.preprocessing.levels import CERTAIN_RATIO, DOUBTED, RARE
 
 _SHOWN = 1.0  # evidence that excludes a way to fail, or suggests one
-_ALONE = 0.5  # of what lines move, that is no offset of their pad
+_ALONE = 0.7  # of what lines move, that is no offset of their pad
 _NO_READING = (FaultKind.LATE, FaultKind.COPY, FaultKind.WEAK)  # but frames, a cell, a gain
 
 Floats = NDArray[np.float64]

@@ -88,7 +88,7 @@ def test_cells_beside_an_object_are_disturbed(fitted: SelfDiagnosis):
 def test_healthy_taxels_have_no_fault(fitted: SelfDiagnosis):
     diagnosis = fitted.diagnose(recordings(12, 5))
     assert not diagnosis.faults
-    assert diagnosis.coverage.test_coverage > 0.95
+    assert diagnosis.coverage.test_coverage > 0.9
 
 
 def test_a_dead_axis_is_a_cell_and_a_dead_position_one_cause(fitted: SelfDiagnosis):

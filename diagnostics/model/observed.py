@@ -239,8 +239,13 @@ class Observed:
         that stays holds it."""
         log = self.log
         of_pad = self.predictor.on_pad(np.where(self.known, log.load, 0).astype(np.float32))
-        found = _same(of_pad) & _same(log.load) & ~log.record.first[:, None]
-        return found & (log.level < log.symbols.top)
+        changes = np.abs(np.diff(log.above, axis=0, prepend=log.above[:1]))
+        dithers = changes <= DITHER * log.symbols.rest.full
+        nobody_moves = self.predictor.on_pad((self.known & ~dithers).astype(np.float32)) == 0
+        of_others = _same(of_pad) | nobody_moves
+        stays = of_others & (_same(log.load) | dithers) & ~log.record.first[:, None]
+        found: Mask = stays & (log.level < log.symbols.top)
+        return found
 
     def delayed(self, lag: int) -> Array:
         """Return log P(observed level) ``[n, D]`` by what the others said ``lag`` pieces ago; by

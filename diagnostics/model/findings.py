@@ -15,9 +15,9 @@ from diagnostics.decision.root_causes import OF_WIRES, REFUTED_KINDS, CellFindin
 from diagnostics.evidence.stream_state import StreamState
 from diagnostics.faults import Fault, FaultKind
 from diagnostics.layout import SensorLayout
-from diagnostics.model.judge import HELD, Judgement, Model
+from diagnostics.model.judge import Judgement, Model
 from diagnostics.model.objects import judged_with_objects
-from diagnostics.model.observed import Log
+from diagnostics.model.observed import HELD, Log
 from diagnostics.model.record import Mask
 from diagnostics.model.symbols import NOTHING
 from diagnostics.model.ways import DRIFTS, WAYS

@@ -25,7 +25,7 @@ from diagnostics.faults import FaultKind
 from diagnostics.model.as_one import AsOne
 from diagnostics.model.groups import Groups
 from diagnostics.model.lines import Failing, Lines
-from diagnostics.model.observed import Log, Observed
+from diagnostics.model.observed import HELD, Log, Observed
 from diagnostics.model.over_time import USUAL, Units, within_limit
 from diagnostics.model.predictor import Predictor
 from diagnostics.model.record import Array, Cells, Mask, Record, Recorder, record_of
@@ -37,7 +37,6 @@ _SUSPECT = 3.0  # evidence of a fault with which a cell predicts no other
 _WORST = 0.5  # of the highest evidence: who leaves in one round
 _ROUNDS = 16
 _GOES = 6.0  # evidence that a fault has gone
-HELD = 3  # pieces at the end at one load: it may be stuck
 _PREVALENCE = 0.03
 _WEIGHS = 20.0  # cells that the usual prevalence is worth
 _ITERATIONS = 10
@@ -239,6 +238,7 @@ class Model:
         # of what never moved in the reference only a value that it holds away from rest tells
         holds = (log.level[-1] > 0) & (log.run >= HELD)
         judged = log.received & (self.living | holds) & ~log.overloaded
+        judged &= len(log.record) >= HELD  # fewer pieces prove nothing
         disturbed = log.disturbed
         only_held = disturbed | ~self.living
         counts = _counting(evidence, WAYS, only_held)

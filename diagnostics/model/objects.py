@@ -32,8 +32,8 @@ from scipy.special import expit
 from diagnostics.decision.line_cover import PROVEN
 from diagnostics.decision.static_load import StaticLoad
 from diagnostics.layout import SensorLayout
-from diagnostics.model.judge import HELD, Judgement, Model
-from diagnostics.model.observed import Log
+from diagnostics.model.judge import Judgement, Model
+from diagnostics.model.observed import HELD, Log
 from diagnostics.model.record import Array, Cells, Mask, Record
 from diagnostics.model.symbols import AT_REST, CONSTANT, NOTHING, root_load
 from diagnostics.preprocessing.levels import ANYWHERE, EXPECTED

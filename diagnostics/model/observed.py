@@ -21,6 +21,7 @@ from diagnostics.model.symbols import (
     root_load,
 )
 
+HELD = 3  # pieces at the end at one load: it may be stuck
 _STAYS = 0.05  # of a root load, or of those of a pad: a smaller change is none
 _ODD = 8.0  # nats of a unit beyond those expected
 _LOOKS = np.log([[0.95, 0.03, 0.02], [0.1, 0.88, 0.02]])  # of a held value without and with dither

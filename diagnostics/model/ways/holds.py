@@ -13,7 +13,7 @@ from functools import partial
 
 import numpy as np
 
-from diagnostics.model.observed import Observed
+from diagnostics.model.observed import HELD, Observed
 from diagnostics.model.over_time import Units, for_good, since
 from diagnostics.model.record import Array, Cells
 from diagnostics.model.symbols import MOVES
@@ -43,7 +43,7 @@ def _evidence(observed: Observed, units: Units, *, dithers: bool) -> Array:
     at_end = (log.value >= rest.full - tolerance) | (log.value <= tolerance)
     expected = _EXPECTED[(at_rest | at_end).astype(np.intp)]
     found: Array = for_good(_ratio(observed, dithers=dithers), units) + expected
-    return found
+    return np.where(log.run >= HELD, found, np.minimum(found, 0))
 
 
 def _since(observed: Observed, units: Units, *, dithers: bool) -> Cells:

@@ -41,6 +41,7 @@ _PREVALENCE = 0.03
 _WEIGHS = 20.0  # cells that the usual prevalence is worth
 _ITERATIONS = 10
 _DECIDING = [i for i, way in enumerate(WAYS) if way.decides]
+_FLOATS = WAYS.index(FLOATS)
 _OTHERS = [i for i, way in enumerate(WAYS) if not way.decides]
 _EXPLAINS = 0.5  # of the evidence of any way: a value that is held
 _NEARLY_ALL = 0.9  # of it: what tells more than that a cell floats
@@ -170,11 +171,11 @@ class Model:
         highest = self.highest[0] + share * (self.highest[1] - self.highest[0])
         longer = len(units.begins) / long
         floats = FLOATS.evidence(observed, units)
-        floats_surely = within_limit(floats, highest[WAYS.index(FLOATS)], longer)
+        floats_surely = within_limit(floats, highest[_FLOATS], longer)
         every = []
         certain = []
         for i in chosen:
-            evidence = WAYS[i].evidence(observed, units)
+            evidence = floats if i == _FLOATS else WAYS[i].evidence(observed, units)
             surely = within_limit(evidence, highest[i], longer)
             if WAYS[i].floats:
                 evidence = np.minimum(evidence, floats)

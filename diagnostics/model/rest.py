@@ -125,8 +125,7 @@ class Rest:
         of_pads = self.of_pads(record, telling, drift)
         share = _share(record.mean - self.level - drift, of_pads, self.near, self.share)
         # what the reference shows tells more, unless it never saw as much
-        often = np.quantile(np.abs(of_pads), _OFTEN, axis=0)
-        unseen = often > _UNSEEN * self.offsets
+        unseen = _usually(of_pads, _OFTEN) > _UNSEEN * self.offsets
         share = np.where(unseen, share, self.share).astype(np.float32)
         unseen |= (drift != 0).mean(axis=0) > _LASTS
         return Shared(drift, drift + share * of_pads, unseen)
@@ -346,8 +345,9 @@ def fit_rest(record: Record, full: float, step: float, pad: Cells, living: Mask)
     return replace(rest, low=low, noise=noise, offsets=offsets, drifts=drifts, at_top=at_top)
 
 
-def _usually(values: Array) -> Array:
-    found: Array = np.quantile(np.abs(values), _USUALLY, axis=0).astype(np.float32)
+def _usually(values: Array, share: float = _USUALLY) -> Array:
+    """Return what the size of a ``share`` of the values ``[n, D]`` does not exceed, ``[D]``."""
+    found: Array = np.quantile(np.abs(values), share, axis=0).astype(np.float32)
     return found
 
 
@@ -416,7 +416,7 @@ def _around(shared: Array, sure: Mask, record: Record) -> Array:
     is ``sure`` (bool ``[n]``), whichever is less; 0: nowhere."""
     n = len(shared)
     step = np.arange(n)
-    begin = np.maximum.accumulate(np.where(record.first, step, 0))
+    begin = step - since_begin(record.first)
     last = np.maximum.accumulate(np.where(sure, step, -1))
     before = np.where(last >= begin, shared[last], np.inf)
     end = _next(np.append(record.first[1:], True))

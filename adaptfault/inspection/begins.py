@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 
 from diagnostics import SensorLayout
 from diagnostics.preprocessing.levels import MAJORITY
+from diagnostics.preprocessing.quantiles import known_quantile
 
 _FIRST = 3  # frames of a recording from which its begin is taken
 _IN_CONTACT = 0.3  # of the median peak, as the begin of a contact event
@@ -79,7 +80,7 @@ class Begins:
             layout: the array.
         """
         present = layout.present.ravel()
-        origin = np.nan_to_num(_median(self.starts[:, present]))
+        origin = np.nan_to_num(known_quantile(self.starts[:, present], 0.5, axis=0))
         begins = np.nan_to_num(self.starts[:, present] - origin).mean(axis=1)
         loads = self.means - origin.mean()
         ends = loads[:, [0, 2]]
@@ -159,11 +160,3 @@ def _mean(frames: NDArray[Any]) -> Floats:
     total = np.where(known, frames, 0.0).sum(axis=0)
     counts = known.sum(axis=0)
     return np.where(counts > 0, total / np.maximum(counts, 1), np.nan)
-
-
-def _median(starts: Floats) -> Floats:
-    """Return the median of each column; NaN where it has none."""
-    known = ~np.isnan(starts).all(axis=0)
-    median = np.full(starts.shape[1], np.nan)
-    median[known] = np.nanmedian(starts[:, known], axis=0)
-    return median

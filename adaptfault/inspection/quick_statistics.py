@@ -30,6 +30,7 @@ from adaptfault.inspection.begins import Begins, Begun
 from adaptfault.inspection.groupings import Groupings, joined
 from adaptfault.inspection.naming import Naming, classes_of
 from diagnostics import SensorLayout
+from diagnostics.preprocessing.quantiles import known_quantile
 from diagnostics.preprocessing.readings import RecordingBlocks
 from diagnostics.sensor.repeated_frames import Repetitions
 from diagnostics.when import Spans
@@ -147,20 +148,17 @@ class Statistics:
     @property
     def summary(self) -> Summary:
         """What the recordings hold; rest is the median of the lowest readings."""
-        known = self.spans.known.any(axis=0)
         counts, sums = self.together.sums[:2].sum(axis=1)
         classes: dict[str, int] = {}
         for name in self.classes or ():
             classes[name] = classes.get(name, 0) + 1
-        rest = np.full(self.layout.n_cells, np.nan)
-        rest[known] = np.nanmedian(self.spans.low[:, known], axis=0)
         return Summary(
             layout=self.layout,
             lengths=np.array(self.naming.lengths, np.int64),
             mean=np.where(counts > 0, sums / np.maximum(counts, 1), np.nan),
             lowest=np.fmin.reduce(self.spans.low),
             highest=np.fmax.reduce(self.spans.high),
-            rest=rest,
+            rest=known_quantile(self.spans.low, 0.5, axis=0),
             step=None,
             missing=self.missing,
             classes=classes,

@@ -64,7 +64,7 @@ from diagnostics.when.reference_findings import (
     reference_findings,
 )
 
-SCHEMA = "adaptfault.diagnoser/3"
+SCHEMA = "adaptfault.diagnoser/4"
 
 
 @dataclass(frozen=True)

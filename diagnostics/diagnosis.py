@@ -287,7 +287,7 @@ class SelfDiagnosis:
         ``classes`` is the class of each recording, ``[n]``: a fault may show in one class only.
         ``scan``: of the read-out that tests itself (:mod:`diagnostics.evidence.read_out`).
 
-        Without :meth:`fit` (cold start), a log of 32 recordings or more is its own reference
+        Without :meth:`fit` (cold start), a log of 16 recordings or more is its own reference
         (:meth:`for_log`), which takes the time of a fit. In a shorter one, cells are compared with
         cells that have similar surroundings.
 
@@ -355,7 +355,7 @@ class SelfDiagnosis:
         faulty by the cold start on the whole log, are excluded and reported. A cell that moves but
         fails early in them may be learned as it is, and not be found.
 
-        A log of fewer than 32 recordings, or in which most cells never move, is no reference: it is
+        A log of fewer than 16 recordings, or in which most cells never move, is no reference: it is
         judged by this diagnosis.
 
         Args:

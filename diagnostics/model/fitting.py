@@ -49,6 +49,7 @@ _LEFT_OUT = (
     1.0,
 )  # shares of the cells that the network goes without
 _EXAMPLES = 400_000  # of the network
+_JOINED = 0.05  # of the pieces: another recording goes before, as in a log of joined ones
 _UNLOADED = 5  # one in so many pieces in which nothing is loaded
 _LIVES = 1e-5  # of full scale: a range of readings
 _ODD_UNITS = 50.0  # units of all cells that weigh on the share of one
@@ -261,10 +262,13 @@ def _examples(
             if not len(of_part):
                 continue
             chosen = rng.choice(of_part, min(len(of_part), most), replace=False)
-            with_before = np.unique([chosen, np.maximum(chosen - 1, 0)])
-            told = load[with_before]
-            found = predictor.inputs(told, told, record.first[with_before], known)
-            found = found[np.searchsorted(with_before, chosen)][:, cells]
+            joined = rng.random(len(chosen)) < _JOINED
+            before = np.where(joined, rng.choice(mine, len(chosen)), chosen - 1)
+            in_turn = np.stack([before, chosen], axis=1).ravel()
+            first = np.ones(len(in_turn), bool)
+            first[1::2] = record.first[chosen] & ~joined
+            told = load[in_turn]
+            found = predictor.inputs(told, told, first, known)[1::2, cells]
             inputs.append(found.reshape(-1, found.shape[-1]))
             levels.append(reference.level[chosen][:, cells].ravel())
         examples.append((np.concatenate(inputs), np.concatenate(levels)))
@@ -316,8 +320,11 @@ def _judge_logs(
             value = rng.uniform(0, 1) * model.symbols.rest.full
             for frames in log:
                 frames[:, cell] = value
+        of_frame = np.repeat(reference.fold[chosen], [len(frames) for frames in log])
+        if (i + i // len(_LENGTHS)) % 2:  # every other log of each length
+            log = [np.concatenate(log)]
         record = model.record_of(log)
-        held_out.judge(model, reference.fold[chosen][record.recording])
+        held_out.judge(model, of_frame[record.begins])
         healthy = model.living.copy()
         healthy[dead] = False
         told = 3 * i < 2 * _LOGS

@@ -26,8 +26,8 @@ from diagnostics.when.held import Held
 if TYPE_CHECKING:
     from diagnostics.layout import SensorLayout
 
-# recordings from which on a log is its own reference: with a model of ten, healthy cells are blamed
-OWN_REFERENCE = 32
+# recordings from which on a log is its own reference
+OWN_REFERENCE = 16
 
 
 def own_reference(log: RecordingBlocks, held: Held, classes: ArrayLike | None) -> list[int]:

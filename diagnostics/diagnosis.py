@@ -65,6 +65,8 @@ from diagnostics.when.reference_findings import (
 )
 
 SCHEMA = "adaptfault.diagnoser/4"
+# kinds that a cell shows whatever is done
+_OF_ANY_CLASS = (*HOLDS, FaultKind.ALIAS, FaultKind.NOISY)
 
 
 @dataclass(frozen=True)
@@ -683,29 +685,40 @@ class SelfDiagnosis:
         def of_part(some: tuple[int, ...]) -> Diagnosis:
             part = RecordingBlocks([log.given[i] for i in some])
             found = self._diagnosed(part, crosstalk=crosstalk)
-            if self._knows(some, classes):
-                return found
-            # how healthy cells move there is not known: told is what holds a value
-            suspect = np.asarray(held.suspect[list(some)].any(axis=0))
-            told = [
-                fault
-                for fault in found.faults
-                if fault.kind in HOLDS or suspect[list(fault.cells)].any()
-            ]
-            return replace(found, faults=tuple(told))
+            return self._of_known_classes(found, some, held, classes)
 
+        every = tuple(range(len(log)))
         whole = self._diagnosed(log, crosstalk=crosstalk)
+        whole = self._of_known_classes(whole, every, held, classes)
         lengths = [len(given) for given in log.given]
         # without a reference, a part of a log tells less than the whole
         part = None if self.reference_ is None else of_part
         return with_recordings(whole, held, lengths, tolerance, part)
 
-    def _knows(self, some: tuple[int, ...], classes: ArrayLike | None) -> bool:
-        """Return whether the reference has enough recordings of each class that ``some`` recordings
-        of a log have: else it does not know how healthy cells move in them."""
+    def _of_known_classes(
+        self, found: Diagnosis, some: tuple[int, ...], held: Held, classes: ArrayLike | None
+    ) -> Diagnosis:
+        """Return what is ``found`` of ``some`` recordings of a log. Where the reference has too few
+        recordings of one of their classes, it does not know how healthy cells move: told is what
+        holds a value, or is noisy; the others are untested."""
         if self._classes is None or classes is None:
-            return True
-        return self._classes.issuperset(np.asarray(classes)[list(some)].tolist())
+            return found
+        if self._classes.issuperset(np.asarray(classes)[list(some)].tolist()):
+            return found
+        suspect = np.asarray(held.suspect[list(some)].any(axis=0))
+        told = []
+        unknown = np.zeros(len(suspect), bool)
+        for fault in found.faults:
+            if fault.kind in _OF_ANY_CLASS or suspect[list(fault.cells)].any():
+                told.append(fault)
+            else:
+                unknown[list(fault.cells)] = True
+        return replace(
+            found,
+            faults=tuple(told),
+            probability=np.where(unknown, np.minimum(found.probability, 0.5), found.probability),
+            tested=found.tested & ~unknown,
+        )
 
     def spans(self, log: RecordingBlocks) -> Spans:
         """Return the range of the loads of each cell in each recording, each axis of a pad as a pad

@@ -275,7 +275,8 @@ def judged_cold(
         ),
         "events": spatial.events.astype(np.float64),
     }
-    return Judged(found=found, aliases=causes, shown=stream.touched, evidence=evidence)
+    shown = stream.touched & cold.response.follows
+    return Judged(found=found, aliases=causes, shown=shown, evidence=evidence)
 
 
 def _findings(

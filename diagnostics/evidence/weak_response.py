@@ -5,15 +5,17 @@ Detects, in a cold start, cells whose readings follow the loads of their neighbo
 what counts as load. With x the readings of a cell and l the mean load of its eight neighbours, each
 less its mean over a segment of the log::
 
-    z    = sum x l / sqrt(sum x^2 / n  sum l^2)
-         standard normal, if the cell is broken: it has white noise or none
+    r    = sum x l / sqrt(sum x^2 sum l^2)          correlation
+    z    = sqrt(n) r                                standard normal, if the cell is broken
     gain = sum x l / sum l^2                        regression of the readings on the loads
 
 A cell works if z exceeds 4.4 (six in a million), as in a test of Pearson's correlation
 (``scipy.stats.pearsonr``). Its response is weak if gain times the highest l is no load. That a cell
-with a weak response reads no load is no evidence of a fault. It does not detect cells that respond
-with less than their noise, and takes a broken cell for a working one where crosstalk makes it
-follow its neighbours.
+with a weak response reads no load is no evidence of a fault.
+
+A cell is shown to be alive if r is one half or more: what floats, comes late or is latched moves,
+too. It does not detect cells that respond with less than their noise, and takes a broken cell for a
+working one where crosstalk makes it follow its neighbours, or where it is a copy of one.
 """
 
 from __future__ import annotations
@@ -30,6 +32,7 @@ from diagnostics.preprocessing.levels import CERTAIN_RATIO
 if TYPE_CHECKING:
     from diagnostics.layout import SensorLayout
 
+_FOLLOWS = 0.5  # correlation from which on a cell is shown to be alive
 _CERTAIN = float(-ndtri(np.exp(-CERTAIN_RATIO)))  # z from which on a cell follows its neighbours
 
 Floats = NDArray[np.float64]
@@ -77,6 +80,12 @@ class WeakResponse:
             np.maximum(self.highest, around.max(axis=0)),
             self.frames + len(frames) - 1,
         )
+
+    @property
+    def follows(self) -> NDArray[np.bool_]:
+        """The cells that move with those around them, bool ``[D]``."""
+        together = np.sqrt(self.readings * self.loads)
+        return np.asarray((together > 0) & (self.products >= _FOLLOWS * together))
 
     def untestable(self, near: float) -> NDArray[np.bool_]:
         """Return the cells that work and respond by at most ``near``, bool ``[D]``."""

@@ -144,3 +144,16 @@ def test_what_moves_in_a_class_that_the_reference_lacks_is_not_blamed_for_it(see
             one[:, [18, 29, 44, 51]] = 0.61
     diagnosis = SelfDiagnosis(layout).diagnose(log, classes=made.labels[order])
     assert set(diagnosis.fault_set) == {18, 29, 44, 51}
+
+
+def test_a_log_that_lies_class_by_class_blames_nobody_for_a_class_of_the_second_half():
+    layout = SensorLayout(2, 9, 8, full_scale=3.3, rate=20.0)
+    classes = ("nothing", "normal", "softer", "harder")
+    made = simulate(12, layout, n_frames=60, seed=31, classes=classes)
+    order = np.argsort(made.labels, kind="stable")
+    log = [np.array(made.frames[i], np.float64) for i in order]
+    row = list(range(16, 24))
+    for one in log[24:]:
+        one[:, row] = 0.0
+    diagnosis = SelfDiagnosis(layout).diagnose(log, classes=made.labels[order])
+    assert set(diagnosis.fault_set) == set(row)

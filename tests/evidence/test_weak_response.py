@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from contact_recordings import CELLS, LAYOUT, events
 
-from diagnostics import Fault, FaultKind, SelfDiagnosis, inject
+from diagnostics import Fault, FaultKind, SelfDiagnosis, Verdict, inject
 from diagnostics.evidence.weak_response import WeakResponse
 
 STEP = 1 / 1023
@@ -66,3 +66,17 @@ def test_without_a_reference_broken_cells_are_found_among_them(rest: float, dull
     faults = [Fault(FaultKind.OPEN, (cell,)) for cell in dead]
     log = [inject(frames, faults, LAYOUT) for frames in recordings(1, rest, dull, count=24)]
     assert set(SelfDiagnosis(LAYOUT).diagnose(log).fault_set) == set(dead)
+
+
+@pytest.mark.parametrize("moves", ["by itself", "late"])
+def test_without_a_reference_what_moves_without_the_cells_around_is_not_alive(moves: str):
+    cell = LAYOUT.cell(0, 2, 3)
+    for seed in range(3):
+        log = recordings(seed)
+        assert SelfDiagnosis(LAYOUT).diagnose(log).verdicts[cell] == Verdict.ALIVE
+        for frames in log:
+            if moves == "late":
+                frames[:, cell] = np.roll(frames[:, cell], 40)
+            else:
+                frames[:, cell] = 0.3 + 0.2 * np.sin(0.7 * np.arange(len(frames)))
+        assert SelfDiagnosis(LAYOUT).diagnose(log).verdicts[cell] != Verdict.ALIVE

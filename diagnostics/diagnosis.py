@@ -65,8 +65,8 @@ from diagnostics.when.reference_findings import (
 )
 
 SCHEMA = "adaptfault.diagnoser/4"
-# kinds that a cell shows whatever is done
-_OF_ANY_CLASS = (*HOLDS, FaultKind.ALIAS, FaultKind.NOISY)
+# kinds that a cell shows however the others move
+_OF_ANY_MOVEMENT = (*HOLDS, FaultKind.ALIAS, FaultKind.NOISY)
 
 
 @dataclass(frozen=True)
@@ -682,43 +682,25 @@ class SelfDiagnosis:
         tolerance = self.tolerance(log)
         held = self._held(self.spans(log), tolerance, classes)
 
+        def knows(some: tuple[int, ...]) -> bool:
+            if self._classes is None or classes is None:
+                return True
+            return self._classes.issuperset(np.asarray(classes)[list(some)].tolist())
+
         def of_part(some: tuple[int, ...]) -> Diagnosis:
             part = RecordingBlocks([log.given[i] for i in some])
             found = self._diagnosed(part, crosstalk=crosstalk)
-            return self._of_known_classes(found, some, held, classes)
+            # a part of a log does not tell that all of it is disturbed
+            moves = knows(some) and not whole.contradicting
+            return found if moves else _of_any_movement(found, held.suspect[list(some)])
 
-        every = tuple(range(len(log)))
         whole = self._diagnosed(log, crosstalk=crosstalk)
-        whole = self._of_known_classes(whole, every, held, classes)
+        if not knows(tuple(range(len(log)))):
+            whole = _of_any_movement(whole, held.suspect)
         lengths = [len(given) for given in log.given]
         # without a reference, a part of a log tells less than the whole
         part = None if self.reference_ is None else of_part
         return with_recordings(whole, held, lengths, tolerance, part)
-
-    def _of_known_classes(
-        self, found: Diagnosis, some: tuple[int, ...], held: Held, classes: ArrayLike | None
-    ) -> Diagnosis:
-        """Return what is ``found`` of ``some`` recordings of a log. Where the reference has too few
-        recordings of one of their classes, it does not know how healthy cells move: told is what
-        holds a value, or is noisy; the others are untested."""
-        if self._classes is None or classes is None:
-            return found
-        if self._classes.issuperset(np.asarray(classes)[list(some)].tolist()):
-            return found
-        suspect = np.asarray(held.suspect[list(some)].any(axis=0))
-        told = []
-        unknown = np.zeros(len(suspect), bool)
-        for fault in found.faults:
-            if fault.kind in _OF_ANY_CLASS or suspect[list(fault.cells)].any():
-                told.append(fault)
-            else:
-                unknown[list(fault.cells)] = True
-        return replace(
-            found,
-            faults=tuple(told),
-            probability=np.where(unknown, np.minimum(found.probability, 0.5), found.probability),
-            tested=found.tested & ~unknown,
-        )
 
     def spans(self, log: RecordingBlocks) -> Spans:
         """Return the range of the loads of each cell in each recording, each axis of a pad as a pad
@@ -758,6 +740,25 @@ class SelfDiagnosis:
         cold = SelfDiagnosis(layout)
         cold.reference_ = Reference.unknown(layout, rest)
         return cold._diagnosed(log, needed)
+
+
+def _of_any_movement(found: Diagnosis, suspect: NDArray[np.bool_]) -> Diagnosis:
+    """Return what is ``found`` of recordings of which it is not known how healthy cells move: told
+    is what holds a value (``suspect``: bool ``[n, D]``), or is noisy; the others are untested."""
+    holds = suspect.any(axis=0)
+    told = []
+    unknown = np.zeros(len(holds), bool)
+    for fault in found.faults:
+        if fault.kind in _OF_ANY_MOVEMENT or holds[list(fault.cells)].any():
+            told.append(fault)
+        else:
+            unknown[list(fault.cells)] = True
+    return replace(
+        found,
+        faults=tuple(told),
+        probability=np.where(unknown, np.minimum(found.probability, 0.5), found.probability),
+        tested=found.tested & ~unknown,
+    )
 
 
 def _with_causes(

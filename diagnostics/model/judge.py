@@ -8,8 +8,8 @@ as the others say join them. With w the ways to fail and their evidence E_w,
 
 where the prevalence p is that of the log (EM, shrunk to a usual one). A pad may share what the
 reference never saw: an offset, noise, coarse steps. How its cells move then tells nothing of them,
-and only what holds a value is faulty. So it is with all cells, where many of those that move are
-refuted, or trusted ones are odd again and again.
+and only what holds a value is faulty. So it is with a pad of which many cells that move are refuted,
+and with all cells, where that holds of the array, or trusted ones are odd again and again.
 """
 
 from __future__ import annotations
@@ -245,9 +245,10 @@ class Model:
         counts = _counting(evidence, WAYS, only_held)
         log_odds = logit(_PREVALENCE) + _of_any(counts, WAYS)
         alone = log.far & ~failing.cells
-        if self._odd_as_a_whole(observed, alone & (log_odds > 0) & _moves(counts), alone):
-            disturbed = np.ones_like(disturbed)
-            only_held = disturbed
+        odd = self._odd_as_a_whole(observed, alone & (log_odds > 0) & _moves(counts), alone)
+        if (odd & ~disturbed).any():
+            disturbed = disturbed | odd
+            only_held = disturbed | ~self.living
             counts = _counting(evidence, WAYS, only_held)
             log_odds = logit(_PREVALENCE) + _of_any(counts, WAYS)
         return Judgement(
@@ -365,14 +366,17 @@ class Model:
         found: Array = np.where(counts, evidence[beside], -np.inf).max(axis=1, initial=-np.inf)
         return found
 
-    @staticmethod
-    def _odd_as_a_whole(observed: Observed, refuted: Mask, alone: Mask) -> bool:
-        """Return whether many of the cells that move ``alone`` are ``refuted``, bool ``[D]``
-        each, or whether trusted ones odd in many units."""
+    def _odd_as_a_whole(self, observed: Observed, refuted: Mask, alone: Mask) -> Mask:
+        """Return the cells of pads of which many that move ``alone`` are ``refuted``, bool ``[D]``
+        each; all cells, where that holds of the array, or trusted ones are odd in many units."""
+        of_pad = self.predictor.on_pad(np.stack([refuted, alone]).astype(np.float32))
+        many: Mask = (of_pad[0] >= _FEWEST) & (of_pad[0] > _DISTURBED * of_pad[1])
         if refuted.sum() >= _FEWEST and refuted.sum() > _DISTURBED * alone.sum():
-            return True
+            many[:] = True
         odd = observed.odd[:, observed.known].mean(axis=0)
-        return len(odd) >= _FEWEST and bool(np.quantile(odd, _MOST_CELLS) > _STRANGE * USUAL)
+        if len(odd) >= _FEWEST and np.quantile(odd, _MOST_CELLS) > _STRANGE * USUAL:
+            many[:] = True
+        return many
 
 
 def _moves(evidence: Array) -> Mask:

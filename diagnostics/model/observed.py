@@ -23,6 +23,7 @@ from diagnostics.model.symbols import (
 
 HELD = 3  # pieces at the end at one load: it may be stuck
 _STAYS = 0.05  # of a root load, or of those of a pad: a smaller change is none
+_LIGHT = 1  # level up to which a load is no witness of a contact
 _ODD = 8.0  # nats of a unit beyond those expected
 _LOOKS = np.log([[0.95, 0.03, 0.02], [0.1, 0.88, 0.02]])  # of a held value without and with dither
 _USUALLY = 8.0  # cells that the usual look of a piece is worth
@@ -175,15 +176,16 @@ class Observed:
     def _unwitnessed(self) -> Mask:
         """Return where nobody tells of a contact, bool ``[n, D]``.
 
-        A cell rests and nobody on its pad is loaded: that nothing touches a pad is no surprise,
-        however often something usually does. Or nobody is known: all loads may be one contact.
+        Nobody on a pad is loaded but lightly: that nothing touches it is no surprise, however often
+        something usually does; nor that cells rest a little higher. Or nobody is known: all loads
+        may be one contact.
         """
         log = self.log
         if not self.known.any():
             return log.level < log.symbols.top
-        witnesses = (log.load > NOTHING) & self.known
+        witnesses = (log.level > _LIGHT) & self.known
         touched = self.predictor.on_pad(witnesses.astype(np.float32)) > 0
-        found: Mask = (log.level == 0) & ~touched
+        found: Mask = (log.level <= _LIGHT) & ~touched
         return found
 
     def _alike(self) -> tuple[Array, Array]:

@@ -94,6 +94,7 @@ EVERY = mixes([0, 1, 2, 3, 4])
 QUICK = ("none", "a row and a noisy cell")  # of the cold starts, which take longer
 
 
+@pytest.mark.usefixtures("seldom_evaluated")
 @pytest.mark.parametrize(
     ("cold", "mix"),
     [
@@ -124,6 +125,7 @@ def test_a_diagnosis_in_between_changes_nothing(fitted, log, middle):
     assert without_recordings(monitor.diagnosis()) == without_recordings(fitted.diagnose(frames))
 
 
+@pytest.mark.usefixtures("seldom_evaluated")
 def test_a_flush_tells_at_once_what_diagnose_tells(fitted, log, middle):
     for diagnoser in (fitted, COLD):
         frames = inject(log, mixes(middle)["cells"], LAYOUT, seed=0, dither=0.004)[:970]
@@ -272,6 +274,7 @@ def test_a_cell_that_falls_silent_is_reported_soon_and_so_is_its_return(fitted, 
     assert without_recordings(monitor.diagnosis()) == without_recordings(fitted.diagnose(frames))
 
 
+@pytest.mark.usefixtures("seldom_evaluated")
 @pytest.mark.parametrize("share", [0.1, 0.4])
 def test_online_equals_batch_where_readings_are_missing(fitted, log, middle, share: float):
     frames = inject(log, mixes(middle)["cells"], LAYOUT)
@@ -297,6 +300,7 @@ def test_before_any_reading_there_is_nothing_to_diagnose():
         assert monitor.update(np.full(220, np.nan)) == ()
 
 
+@pytest.mark.usefixtures("seldom_evaluated")
 def test_two_monitors_of_one_diagnoser_do_not_disturb_each_other(fitted, log, middle):
     broken = inject(log, [Fault("short", (middle[3],))], LAYOUT)
     a = Monitor(fitted)

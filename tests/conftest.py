@@ -108,11 +108,12 @@ def made_once(
 
 @pytest.fixture(scope="session")
 def fitted(grasps: Recordings, made_once) -> SelfDiagnosis:
-    """Fitted on every other of the simulated grasps; test_serialization.py proves that files lose
+    """Fitted with all steps to every other of the simulated grasps; test_serialization.py proves that files lose
     nothing of it."""
 
     def make(folder: Path) -> None:
-        SelfDiagnosis(grasps.layout).fit(grasps.frames[::2]).save(folder / "fitted.npz")
+        with whole_fit():
+            SelfDiagnosis(grasps.layout).fit(grasps.frames[::2]).save(folder / "fitted.npz")
 
     return SelfDiagnosis.load(made_once("fitted", make) / "fitted.npz")
 

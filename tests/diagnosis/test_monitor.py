@@ -91,14 +91,15 @@ def without_recordings(diagnosis) -> dict:
 
 
 EVERY = mixes([0, 1, 2, 3, 4])
-QUICK = ("none", "a row and a noisy cell")  # of the cold starts, which take longer
+# the others in make test-all, and most of the cold starts, which take longer
+QUICK = {False: ("cells", "a row and a noisy cell", "loose and drifting"), True: ("none",)}
 
 
 @pytest.mark.usefixtures("seldom_evaluated")
 @pytest.mark.parametrize(
     ("cold", "mix"),
     [
-        pytest.param(cold, mix, marks=pytest.mark.slow if cold and mix not in QUICK else ())
+        pytest.param(cold, mix, marks=() if mix in QUICK[cold] else pytest.mark.slow)
         for cold in (False, True)
         for mix in EVERY
     ],
@@ -151,7 +152,8 @@ def test_a_flush_tells_what_a_log_shorter_than_a_segment_shows():
 
 def test_a_fault_is_reported_once_soon_after_it_is_detectable(fitted, log, middle):
     cell = middle[3]
-    _, changes = watched(fitted, inject(log, [Fault("short", (cell,), onset=300)], LAYOUT))
+    broken = inject(log, [Fault("short", (cell,), onset=300)], LAYOUT)
+    _, changes = watched(fitted, broken[:700])
     ((frame, fault),) = changes
     assert (fault.kind, fault.cells) == (FaultKind.SHORT, (cell,))
     assert 300 <= frame < 300 + 8 * 32  # it looks every 32 frames, twice
@@ -159,8 +161,8 @@ def test_a_fault_is_reported_once_soon_after_it_is_detectable(fitted, log, middl
 
 
 def test_a_healthy_run_is_silent(fitted, log):
-    for diagnoser in (fitted, COLD):
-        assert watched(diagnoser, log)[1] == []
+    assert watched(fitted, log)[1] == []
+    assert watched(COLD, log[:500])[1] == []
 
 
 def test_a_fault_that_goes_away_is_reported_as_gone_with_probability_0(fitted, log, middle):
@@ -182,7 +184,7 @@ def test_a_fault_that_spreads_is_reported_as_changed_and_no_cell_of_it_as_gone(f
     row = Line(0, "row", 5)
     first = Fault("short", LAYOUT.cells_on(row)[4:6], onset=100)
     rest = line_fault(LAYOUT, row, FaultKind.SHORT, onset=500)
-    _, reported = watched(fitted, inject(log, [first, rest], LAYOUT))
+    _, reported = watched(fitted, inject(log, [first, rest], LAYOUT)[:800])
     changes = [fault for _, fault in reported if set(fault.cells) & set(rest.cells)]
     assert (changes[-1].line, changes[-1].cells) == (row, rest.cells)
     assert all(fault.probability > 0 for fault in changes)
@@ -190,7 +192,7 @@ def test_a_fault_that_spreads_is_reported_as_changed_and_no_cell_of_it_as_gone(f
 
 def test_while_a_row_breaks_hardly_a_cell_beside_it_is_reported_and_none_for_long(fitted, log):
     row = line_fault(LAYOUT, Line(0, "row", 5), FaultKind.SHORT, onset=500)
-    monitor, changes = watched(fitted, inject(log, [row], LAYOUT))
+    monitor, changes = watched(fitted, inject(log, [row], LAYOUT)[:800])
     assert len({c for _, fault in changes for c in fault.cells} - set(row.cells)) <= 2
     assert set(monitor.diagnosis().fault_set) == set(row.cells)
 
@@ -337,10 +339,10 @@ def test_a_copy_of_a_monitor_goes_on_as_the_monitor_does_and_apart_from_it(
     monitor = Monitor(fitted)
     told(monitor, broken[:140])
     twin = duplicate(monitor)  # while frames 0 to 127 are evaluated
-    found = told(twin, broken[140:600])
+    found = told(twin, broken[140:400])
     assert middle[3] in {cell for _, fault in found for cell in fault.cells}
     assert monitor.diagnosis().n_frames == 140
-    assert told(monitor, broken[140:600]) == found
+    assert told(monitor, broken[140:400]) == found
     assert twin.diagnosis().to_dict() == monitor.diagnosis().to_dict()
 
 

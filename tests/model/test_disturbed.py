@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from pressed_recordings import LAYOUT, REST, presses
+from pressed_recordings import REST, presses
 
 from diagnostics import SelfDiagnosis, Verdict
 

@@ -108,8 +108,8 @@ def made_once(
 
 @pytest.fixture(scope="session")
 def fitted(grasps: Recordings, made_once) -> SelfDiagnosis:
-    """Fitted with all steps to every other of the simulated grasps; test_serialization.py proves that files lose
-    nothing of it."""
+    """Fitted with all steps to every other of the simulated grasps; test_serialization.py proves
+    that files lose nothing of it."""
 
     def make(folder: Path) -> None:
         with whole_fit():

@@ -22,8 +22,11 @@ from adaptfault.data.simulated_grasps import simulate
 from adaptfault.models import forest
 from adaptfault.models.store import save_model
 from diagnostics import Fault, FaultSet, Line, SelfDiagnosis, SensorLayout, inject, line_fault
+from diagnostics.model import fitting, predictor
 
 _TREES = forest.TREES
+_STEPS = predictor._STEPS
+_LOGS = fitting._LOGS
 _WITH_TREES = ("forest", "targets")
 
 # The same few examples on every machine.
@@ -105,13 +108,26 @@ def made_once(
 
 @pytest.fixture(scope="session")
 def fitted(grasps: Recordings, made_once) -> SelfDiagnosis:
-    """Fitted on every other of the simulated grasps; test_serialization.py proves that files lose
-    nothing of it."""
+    """Fitted with all steps to every other of the simulated grasps; test_serialization.py proves
+    that files lose nothing of it."""
 
     def make(folder: Path) -> None:
-        SelfDiagnosis(grasps.layout).fit(grasps.frames[::2]).save(folder / "fitted.npz")
+        with whole_fit():
+            SelfDiagnosis(grasps.layout).fit(grasps.frames[::2]).save(folder / "fitted.npz")
 
     return SelfDiagnosis.load(made_once("fitted", make) / "fitted.npz")
+
+
+@pytest.fixture(scope="session")
+def pressed(made_once) -> SelfDiagnosis:
+    """Fitted with all steps to 80 recordings of presses; see pressed_recordings.py."""
+    from pressed_recordings import LAYOUT, presses
+
+    def make(folder: Path) -> None:
+        with whole_fit():
+            SelfDiagnosis(LAYOUT).fit(presses(0, 80)).save(folder / "fitted.npz")
+
+    return SelfDiagnosis.load(made_once("pressed", make) / "fitted.npz")
 
 
 @pytest.fixture
@@ -241,6 +257,13 @@ def export_versions(home: Path) -> None:
         add_onnx(home / name)
 
 
+@pytest.fixture
+def seldom_evaluated(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let a monitor evaluate after every 96 frames, as it does on a larger array, where the frame
+    that tells a fault is not what is proven: evaluations take most of its time."""
+    monkeypatch.setattr("diagnostics.monitor.Monitor._pace", lambda monitor, pieces: (88, 96))
+
+
 class Clock:
     """Stands in for the time module: its seconds pass only where a test lets them, however fast the
     machine is."""
@@ -333,9 +356,31 @@ def rough_fit() -> Iterator[None]:
         yield
 
 
+@contextmanager
+def whole_fit() -> Iterator[None]:
+    """Let a fit take all its steps and judge all its logs, where its accuracy is what is proven."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("diagnostics.model.predictor._STEPS", _STEPS)
+        patch.setattr("diagnostics.model.fitting._LOGS", _LOGS)
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def rough_fits() -> Iterator[None]:
+    """Let fits be rough; see ``wholly_fitted``."""
+    with rough_fit():
+        yield
+
+
 @pytest.fixture
 def roughly_fitted() -> Iterator[None]:
     with rough_fit():
+        yield
+
+
+@pytest.fixture
+def wholly_fitted() -> Iterator[None]:
+    with whole_fit():
         yield
 
 

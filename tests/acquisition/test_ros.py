@@ -405,6 +405,7 @@ def test_each_of_several_topics_has_its_restored_one():
         _ = replace(several, restored="/whole").restored_topics
 
 
+@pytest.mark.usefixtures("seldom_evaluated")
 def test_the_node_restores_known_faults_and_those_that_its_monitor_finds(fitted, grasps, log):
     known = FaultSet((115,), LAYOUT.n_cells)
     watch = watch_of(fitted, known=known, restorer=Restorer(LAYOUT).fit(grasps.frames[::7]))

@@ -24,7 +24,7 @@ pytestmark = pytest.mark.usefixtures("roughly_fitted")
 
 @pytest.fixture
 def data_set(tmp_path):
-    """40 recordings; cell 7 is dead."""
+    """30 recordings; cell 7 is dead."""
     rng = np.random.default_rng(0)
     course = np.maximum(np.sin(np.linspace(-0.5, np.pi + 0.5, 60)), 0)[:, None]
     dead = Fault("short", (7,))
@@ -34,7 +34,7 @@ def data_set(tmp_path):
             [dead],
             LAYOUT,
         )
-        for _ in range(40)
+        for _ in range(30)
     ]
     folder = tmp_path / "set"
     folder.mkdir()
@@ -46,7 +46,7 @@ def check(folder, *options):
     return main(["check", str(folder), "--quiet", *options])
 
 
-@pytest.mark.parametrize("options", [(), ("--healthy", "0:20"), ("--fail-on", "never")])
+@pytest.mark.parametrize("options", [(), ("--healthy", "0:15"), ("--fail-on", "never")])
 def test_what_is_printed_is_as_the_schema_says(data_set, options, capsys, tmp_path):
     (data_set / "broken.npz").write_bytes(b"PK")
     out = tmp_path / "out.json"

@@ -645,6 +645,7 @@ def test_a_log_that_tests_nothing_exits_with_the_code_that_is_set(made_bundle, t
         ] == [0, 2, 3]
 
 
+@pytest.mark.usefixtures("wholly_fitted")
 def test_the_fit_reports_shares_that_rise_to_all_of_it(small):
     shares = []
     SelfDiagnosis(SMALL).fit(small.frames[::4], progress=shares.append)

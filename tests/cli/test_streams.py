@@ -67,7 +67,7 @@ ODD = {
 
 @pytest.mark.parametrize(
     "name",
-    [pytest.param(name, marks=[pytest.mark.slow] if "closed" in name else []) for name in ODD],
+    [pytest.param(name, marks=() if name == "full" else pytest.mark.slow) for name in ODD],
 )
 def test_whatever_stdout_is_a_run_deploys_and_its_code_says_so(robot, name):
     then, environment, told = ODD[name]

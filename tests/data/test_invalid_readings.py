@@ -40,6 +40,7 @@ def test_one_impossible_reading_counts_as_missing(
     assert Diagnosis.from_dict(found.to_dict()).transport == found.transport
 
 
+@pytest.mark.usefixtures("seldom_evaluated")
 def test_the_monitor_still_finds_faults_after_one(fitted: SelfDiagnosis, log: np.ndarray):
     monitor = Monitor(fitted)
     news = [fault for frame in with_one(log, np.inf) for fault in monitor.update(frame)]

@@ -91,13 +91,15 @@ def without_recordings(diagnosis) -> dict:
 
 
 EVERY = mixes([0, 1, 2, 3, 4])
-QUICK = ("none", "a row and a noisy cell")  # of the cold starts, which take longer
+# the others in make test-all, and most of the cold starts, which take longer
+QUICK = {False: ("cells", "a row and a noisy cell", "loose and drifting"), True: ("none",)}
 
 
+@pytest.mark.usefixtures("seldom_evaluated")
 @pytest.mark.parametrize(
     ("cold", "mix"),
     [
-        pytest.param(cold, mix, marks=pytest.mark.slow if cold and mix not in QUICK else ())
+        pytest.param(cold, mix, marks=() if mix in QUICK[cold] else pytest.mark.slow)
         for cold in (False, True)
         for mix in EVERY
     ],
@@ -112,18 +114,20 @@ def test_frame_by_frame_it_gives_the_diagnosis_of_all_frames(
     assert without_recordings(monitor.diagnosis()) == without_recordings(diagnoser.diagnose(frames))
 
 
+@pytest.mark.usefixtures("seldom_evaluated")
 def test_a_diagnosis_in_between_changes_nothing(fitted, log, middle):
     frames = inject(log, mixes(middle)["cells"], LAYOUT)
     monitor = Monitor(fitted)
     for i, frame in enumerate(frames):
         monitor.update(frame)
-        if i % 111 == 50:
+        if i % 222 == 50:
             assert without_recordings(monitor.diagnosis()) == without_recordings(
                 fitted.diagnose(frames[: i + 1])
             )
     assert without_recordings(monitor.diagnosis()) == without_recordings(fitted.diagnose(frames))
 
 
+@pytest.mark.usefixtures("seldom_evaluated")
 def test_a_flush_tells_at_once_what_diagnose_tells(fitted, log, middle):
     for diagnoser in (fitted, COLD):
         frames = inject(log, mixes(middle)["cells"], LAYOUT, seed=0, dither=0.004)[:970]
@@ -149,7 +153,8 @@ def test_a_flush_tells_what_a_log_shorter_than_a_segment_shows():
 
 def test_a_fault_is_reported_once_soon_after_it_is_detectable(fitted, log, middle):
     cell = middle[3]
-    _, changes = watched(fitted, inject(log, [Fault("short", (cell,), onset=300)], LAYOUT))
+    broken = inject(log, [Fault("short", (cell,), onset=300)], LAYOUT)
+    _, changes = watched(fitted, broken[:700])
     ((frame, fault),) = changes
     assert (fault.kind, fault.cells) == (FaultKind.SHORT, (cell,))
     assert 300 <= frame < 300 + 8 * 32  # it looks every 32 frames, twice
@@ -157,8 +162,8 @@ def test_a_fault_is_reported_once_soon_after_it_is_detectable(fitted, log, middl
 
 
 def test_a_healthy_run_is_silent(fitted, log):
-    for diagnoser in (fitted, COLD):
-        assert watched(diagnoser, log)[1] == []
+    assert watched(fitted, log)[1] == []
+    assert watched(COLD, log[:500])[1] == []
 
 
 def test_a_fault_that_goes_away_is_reported_as_gone_with_probability_0(fitted, log, middle):
@@ -180,7 +185,7 @@ def test_a_fault_that_spreads_is_reported_as_changed_and_no_cell_of_it_as_gone(f
     row = Line(0, "row", 5)
     first = Fault("short", LAYOUT.cells_on(row)[4:6], onset=100)
     rest = line_fault(LAYOUT, row, FaultKind.SHORT, onset=500)
-    _, reported = watched(fitted, inject(log, [first, rest], LAYOUT))
+    _, reported = watched(fitted, inject(log, [first, rest], LAYOUT)[:800])
     changes = [fault for _, fault in reported if set(fault.cells) & set(rest.cells)]
     assert (changes[-1].line, changes[-1].cells) == (row, rest.cells)
     assert all(fault.probability > 0 for fault in changes)
@@ -188,7 +193,7 @@ def test_a_fault_that_spreads_is_reported_as_changed_and_no_cell_of_it_as_gone(f
 
 def test_while_a_row_breaks_hardly_a_cell_beside_it_is_reported_and_none_for_long(fitted, log):
     row = line_fault(LAYOUT, Line(0, "row", 5), FaultKind.SHORT, onset=500)
-    monitor, changes = watched(fitted, inject(log, [row], LAYOUT))
+    monitor, changes = watched(fitted, inject(log, [row], LAYOUT)[:800])
     assert len({c for _, fault in changes for c in fault.cells} - set(row.cells)) <= 2
     assert set(monitor.diagnosis().fault_set) == set(row.cells)
 
@@ -272,6 +277,7 @@ def test_a_cell_that_falls_silent_is_reported_soon_and_so_is_its_return(fitted, 
     assert without_recordings(monitor.diagnosis()) == without_recordings(fitted.diagnose(frames))
 
 
+@pytest.mark.usefixtures("seldom_evaluated")
 @pytest.mark.parametrize("share", [0.1, 0.4])
 def test_online_equals_batch_where_readings_are_missing(fitted, log, middle, share: float):
     frames = inject(log, mixes(middle)["cells"], LAYOUT)
@@ -297,6 +303,7 @@ def test_before_any_reading_there_is_nothing_to_diagnose():
         assert monitor.update(np.full(220, np.nan)) == ()
 
 
+@pytest.mark.usefixtures("seldom_evaluated")
 def test_two_monitors_of_one_diagnoser_do_not_disturb_each_other(fitted, log, middle):
     broken = inject(log, [Fault("short", (middle[3],))], LAYOUT)
     a = Monitor(fitted)
@@ -333,10 +340,10 @@ def test_a_copy_of_a_monitor_goes_on_as_the_monitor_does_and_apart_from_it(
     monitor = Monitor(fitted)
     told(monitor, broken[:140])
     twin = duplicate(monitor)  # while frames 0 to 127 are evaluated
-    found = told(twin, broken[140:600])
+    found = told(twin, broken[140:400])
     assert middle[3] in {cell for _, fault in found for cell in fault.cells}
     assert monitor.diagnosis().n_frames == 140
-    assert told(monitor, broken[140:600]) == found
+    assert told(monitor, broken[140:400]) == found
     assert twin.diagnosis().to_dict() == monitor.diagnosis().to_dict()
 
 

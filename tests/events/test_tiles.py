@@ -21,7 +21,7 @@ from diagnostics.preprocessing.readings import RecordingBlocks
 from diagnostics.preprocessing.scale import Scale
 from diagnostics.simulation.injection import bridge
 
-SKIN = SensorLayout(2, 24, 24, rate=20.0)
+SKIN = SensorLayout(2, 16, 16, rate=20.0)  # more cells than one tile has
 
 
 def log(
@@ -100,18 +100,18 @@ def test_dead_cells_rows_and_a_bridge_are_found_and_hardly_a_healthy_cell_is_rep
         Fault(FaultKind.SHORT, (int(c),)) for c in rng.choice(SKIN.n_cells // 2, 12, replace=False)
     ]
     faults += [
-        line_fault(SKIN, Line(0, "row", 15), FaultKind.OPEN),
+        line_fault(SKIN, Line(0, "row", 10), FaultKind.OPEN),
         bridge(SKIN, Line(1, "column", 10)),
     ]
     diagnosis = fitted.diagnose([inject(log(SKIN, 200, 50 + i), faults, SKIN) for i in range(4)])
     broken = {cell for fault in faults for cell in fault.cells}
-    assert {f.line for f in diagnosis.faults[:2]} == {Line(0, "row", 15), Line(1, "column", 10)}
+    assert {f.line for f in diagnosis.faults[:2]} == {Line(0, "row", 10), Line(1, "column", 10)}
     assert broken <= set(diagnosis.fault_set)
     assert len(diagnosis.fault_set) <= 1.06 * len(broken)
 
 
 def test_a_stuck_address_bit_is_named_even_where_cells_of_its_lines_are_dead(fitted):
-    dead = [Fault(FaultKind.SHORT, (SKIN.cell(1, row, 3 * row % 24),)) for row in range(0, 24, 3)]
+    dead = [Fault(FaultKind.SHORT, (SKIN.cell(1, row, 3 * row % 16),)) for row in range(0, 16, 3)]
     fault = line_fault(SKIN, Line(1, "row_address", 1), FaultKind.ALIAS, value=1)
     found = fitted.diagnose(
         [inject(log(SKIN, 200, 60 + i), [fault, *dead], SKIN) for i in range(3)]
@@ -129,8 +129,8 @@ def test_a_short_without_any_contact_is_found_and_an_object_at_rest_there_is_no_
     short = SKIN.cell(1, 12, 12)
     found = fitted.diagnose(inject(frames, [Fault(FaultKind.SHORT, (short,))], SKIN)).fault_set
     assert found == {short}
-    rows, cols = np.mgrid[:24, :24]
-    thing = np.clip(3 - 0.3 * ((rows - 5) ** 2 + (cols - 15) ** 2), 0, None)
+    rows, cols = np.mgrid[:16, :16]
+    thing = np.clip(3 - 0.3 * ((rows - 5) ** 2 + (cols - 11) ** 2), 0, None)
     for begin in (0, 33):
         lies = frames.copy()
         lies.reshape(400, *SKIN.shape)[begin:, 1] = thing
@@ -198,9 +198,9 @@ def test_memory_per_cell_does_not_grow_with_the_array_in_fitting_or_diagnosing()
 def test_numbers_of_any_kind_are_converted_where_they_are_read_and_give_the_same():
     frames = log(SKIN, 40, 0)
     counts = np.round(frames / 5.0 * 4095).astype(np.uint16)
-    layout = SensorLayout(2, 24, 24, full_scale=4095, unit="counts")
+    layout = SensorLayout(2, 16, 16, full_scale=4095, unit="counts")
     cold = SelfDiagnosis(layout)
     assert cold.diagnose(counts).to_dict() == cold.diagnose(counts.astype(float)).to_dict()
     assert (
-        cold.diagnose([counts.reshape(40, 2, 24, 24)]).to_dict() == cold.diagnose(counts).to_dict()
+        cold.diagnose([counts.reshape(40, 2, 16, 16)]).to_dict() == cold.diagnose(counts).to_dict()
     )

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from pressed_recordings import LAYOUT, REST, presses
+from pressed_recordings import REST, presses
 
 from diagnostics import SelfDiagnosis, Verdict
 
@@ -46,8 +46,8 @@ Disturb = Callable[[np.ndarray], np.ndarray]
 
 
 @pytest.fixture(scope="module")
-def fitted() -> SelfDiagnosis:
-    return SelfDiagnosis(LAYOUT).fit(presses(0, 80))
+def fitted(pressed: SelfDiagnosis) -> SelfDiagnosis:
+    return pressed
 
 
 def disturbed(disturb: Disturb) -> list[np.ndarray]:

@@ -40,7 +40,7 @@ def untouched(
 @pytest.fixture(scope="module")
 def fitted() -> SelfDiagnosis:
     with rough_fit():
-        return SelfDiagnosis(LAYOUT).fit(touched(0, 0.0005, each=40))
+        return SelfDiagnosis(LAYOUT).fit(touched(0, 0.0005, each=20))
 
 
 @settings(max_examples=50, deadline=None)

@@ -151,7 +151,7 @@ def test_runs_of_a_robot_show_the_cell_that_weakens_and_when_it_will_be_too_weak
     assert main(command) == 0
     assert "no run has measured" in capsys.readouterr().out
     today = datetime(2026, 1, 1, tzinfo=timezone.utc)
-    grasps = af.simulate(8, layout, n_frames=40, seed=100, classes=power_cut.CLASSES[1:])
+    grasps = af.simulate(6, layout, n_frames=40, seed=100, classes=power_cut.CLASSES[1:])
     for week in range(10):
         rng = np.random.default_rng(week)
         frames = [

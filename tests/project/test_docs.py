@@ -72,10 +72,11 @@ def prepared(made_bundle, small_grasps, later_grasps, broken_row, tmp_path_facto
     home = tmp_path_factory.mktemp("docs")
     layout = small_grasps.layout
     broken = Recordings(tuple(inject(r, [broken_row], layout) for r in later_grasps), layout)
-    for name, recordings in {"grasps": small_grasps, "today": broken, "recordings": broken}.items():
+    grasps = small_grasps.select(range(0, len(small_grasps), 2))
+    for name, recordings in {"grasps": grasps, "today": broken, "recordings": broken}.items():
         (home / name).mkdir()
         save_npz(home / name / f"{name}.npz", recordings)
-    save_npz(home / "grasps.npz", small_grasps)
+    save_npz(home / "grasps.npz", grasps)
     held = [f for f, label in zip(small_grasps.frames, small_grasps.labels, strict=True) if label]
     write_forces(home / "force", held[::3])
     shutil.copytree(made_bundle, home / "robot.bundle")

@@ -101,6 +101,7 @@ ROWS_OF = {
     "fingertips": ("cells", "onset", "healthy", "holds", "cold"),
     "soles": ("cells", "onset", "healthy", "holds", "lines"),
 }
+QUICK = ("cells", "healthy")  # of those on simulated grasps
 REAL = {array.name: array for array in ARRAYS if array.name in ROWS_OF}
 Row = tuple[str, float, float, bool]  # name, value, its standard error, whether more is better
 
@@ -149,7 +150,13 @@ OF_ROW = {
 }
 
 
-@pytest.mark.parametrize("name", ROWS_OF[GRASPS])
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=() if name in QUICK else pytest.mark.slow)
+        for name in ROWS_OF[GRASPS]
+    ],
+)
 def test_on_simulated_grasps_the_main_rows_hold(
     name: str, grasps: Recordings, fitted: SelfDiagnosis
 ):

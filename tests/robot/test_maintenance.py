@@ -454,7 +454,15 @@ def test_exchanged_rows_are_undone_in_software_and_the_robot_predicts_as_before(
 
 
 @pytest.mark.usefixtures("worthwhile")
-@pytest.mark.parametrize("exchanged", [(0, 8), (0, 12), (12, 24), (0, 20)])
+@pytest.mark.parametrize(
+    "exchanged",
+    [
+        (0, 8),
+        pytest.param((0, 12), marks=pytest.mark.slow),
+        (12, 24),
+        pytest.param((0, 20), marks=pytest.mark.slow),
+    ],
+)
 def test_wires_that_not_each_half_of_a_log_shows_exchanged_are_not_undone(
     bundle, later_grasps, exchanged
 ):

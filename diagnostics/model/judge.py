@@ -8,7 +8,7 @@ as the others say join them. With w the ways to fail and their evidence E_w,
 
 where the prevalence p is that of the log (EM, shrunk to a usual one). A pad may share what the
 reference never saw: an offset, noise, coarse steps. How its cells move then tells nothing of them,
-and only what holds a value is faulty. So it is with a pad of which many cells that move are refuted,
+and only what holds a value is faulty. So it is with a pad of which many moving cells are refuted,
 and with all cells, where that holds of the array, or trusted ones are odd again and again.
 """
 

@@ -13,7 +13,6 @@ from diagnostics.model.record import Array, Mask, Record
 from diagnostics.model.rest import DITHER
 from diagnostics.model.symbols import (
     MOVES,
-    NOTHING,
     Flatness,
     Symbols,
     activity_of,

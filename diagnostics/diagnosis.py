@@ -745,7 +745,7 @@ class SelfDiagnosis:
 def _of_any_movement(found: Diagnosis, suspect: NDArray[np.bool_]) -> Diagnosis:
     """Return what is ``found`` of recordings of which it is not known how healthy cells move: told
     is what holds a value (``suspect``: bool ``[n, D]``), or is noisy; the others are untested."""
-    holds = suspect.any(axis=0)
+    holds = np.asarray(suspect.any(axis=0))
     told = []
     unknown = np.zeros(len(holds), bool)
     for fault in found.faults:

@@ -115,6 +115,55 @@ def test_missing_readings_and_scales_of_cf_are_used(tmp_path):
         check(tmp_path / name, expected=expected)
 
 
+def unsigned_classic(path, stored, **attributes):
+    """Write as netCDF 3 does, which has no type without a sign."""
+    with scipy.io.netcdf_file(path, "w") as file:
+        for name, size in (("time", len(stored)), ("cell", stored.shape[1])):
+            file.createDimension(name, size)
+        kind = f"i{stored.dtype.itemsize}"
+        variable = file.createVariable("tactile", kind, ("time", "cell"))
+        variable[:] = stored.view(kind)
+        for name, value in {"_Unsigned": "true", **attributes}.items():
+            setattr(variable, name, value)
+
+
+def test_numbers_without_a_sign_are_so_in_netcdf(tmp_path):
+    stored = (X % 256).astype(np.uint8)
+    unsigned_classic(tmp_path / "three.nc", stored)
+    unsigned_classic(tmp_path / "wide.nc", (X + 40_000).astype(np.uint16))
+    packing = {"_FillValue": np.int8(-1), "scale_factor": 0.5}
+    unsigned_classic(tmp_path / "scaled.nc", stored, **packing)
+    with h5py.File(tmp_path / "four.h5", "w") as file:
+        file["tactile"] = stored.view(np.int8)
+        file["tactile"].attrs["_Unsigned"] = "true"
+    check(tmp_path / "three.nc", expected=stored)
+    check(tmp_path / "four.h5", expected=stored)
+    check(tmp_path / "wide.nc", expected=X + 40_000)
+    scaled = np.where(stored == 255, np.nan, stored * np.float32(0.5))
+    check(tmp_path / "scaled.nc", expected=scaled)
+
+
+@pytest.mark.parametrize(
+    "limits",
+    [
+        {"valid_range": [100, 3900]},
+        {"valid_min": 100, "valid_max": 3900},
+        {"valid_range": [50.0, 1950.0]},  # of another type than what is stored: of the readings
+    ],
+)
+def test_what_lies_outside_the_valid_range_of_cf_is_missing(tmp_path, limits):
+    stored = X.astype(np.int16)
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["tactile"] = stored
+        file["tactile"].attrs.update({**limits, "scale_factor": 0.5})
+    array = zarr.open_group(tmp_path / "a.zarr", mode="w").create_array("tactile", data=stored)
+    array.attrs.update({**limits, "scale_factor": 0.5})
+    expected = np.where((X < 100) | (X > 3900), np.nan, X / 2)
+    assert np.isnan(expected).any()
+    for name in ("a.zarr", "a.h5"):
+        check(tmp_path / name, expected=expected)
+
+
 def test_netcdf_of_all_versions_is_read(tmp_path):
     with h5py.File(tmp_path / "four.nc", "w") as file:
         file["tactile"] = X.reshape(-1, 3, 4)

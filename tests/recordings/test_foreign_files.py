@@ -362,6 +362,17 @@ def test_complex_numbers_and_records_are_refused_by_what_they_are(tmp_path):
     assert "tactile holds records of several fields" in refusal(tmp_path / "b.h5")
 
 
+def test_where_a_file_holds_nothing_else_the_reason_of_what_was_left_out_is_told(tmp_path):
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["log"] = np.zeros(5, [("time", "f8"), ("tactile", "f4", 12)])
+    assert "log holds records of several fields" in refusal(tmp_path / "a.h5")
+    with h5py.File(tmp_path / "b.h5", "w") as file:
+        rows = file.create_dataset("log", 5, h5py.vlen_dtype(np.float32))
+        for frame in range(5):
+            rows[frame] = np.zeros(12)
+    assert "log holds a list a frame" in refusal(tmp_path / "b.h5")
+
+
 # What declares more than it holds, and what has no end
 
 

@@ -174,7 +174,8 @@ class Chooser:
         """Raise the reason why an array that is meant was left out."""
         for name, why in self.contents.left_out.items():
             asked = key is not None and last_part(name) in map(last_part, key.split(","))
-            if asked or (key is None and is_touch(name)):
+            is_all = not self.contents.arrays
+            if asked or (key is None and (is_all or is_touch(name))):
                 raise InputError.at(self.path, f"{name} {why}")
 
     def _sizes(self, name: str) -> Sizes:

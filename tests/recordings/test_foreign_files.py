@@ -373,6 +373,36 @@ def test_where_a_file_holds_nothing_else_the_reason_of_what_was_left_out_is_told
     assert "log holds a list a frame" in refusal(tmp_path / "b.h5")
 
 
+def test_frames_and_times_that_belong_to_nothing_are_told(tmp_path):
+    grids = X.reshape(-1, 3, 4)
+    with h5py.File(tmp_path / "ends.h5", "w") as file:
+        file["data/tactile"] = grids
+        file["meta/episode_ends"] = [30, 50]
+    with h5py.File(tmp_path / "times.h5", "w") as file:
+        file["tactile"] = grids
+        file["time"] = np.arange(40) / 50
+    with h5py.File(tmp_path / "pads.h5", "w") as file:
+        file["tactile_left"] = grids[:, :, :2]
+        file["tactile_right"] = grids[:40, :, 2:]
+
+    def told(loaded):
+        return [message.partition(".h5: ")[2] for message in messages(loaded, "warning")]
+
+    ends = load(tmp_path / "ends.h5")
+    assert [len(one) for one in ends.recordings.frames] == [30, 20]
+    assert told(ends) == [
+        "data/tactile: 10 frames behind the last end in meta/episode_ends are left out"
+    ]
+    assert told(load(tmp_path / "times.h5")) == [
+        "time holds 40 values where tactile has 60 frames: passed over"
+    ]
+    pads = load(tmp_path / "pads.h5", layout="2x3x2")
+    assert [len(one) for one in pads.recordings.frames] == [40]
+    assert told(pads) == [
+        "tactile_left holds 60 frames where tactile_right has 40: the last 20 are left out"
+    ]
+
+
 # What declares more than it holds, and what has no end
 
 

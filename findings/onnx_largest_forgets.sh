@@ -1,13 +1,13 @@
 #!/bin/sh
 # Guess: the largest reading of a pad, exported from torch to ONNX, is NaN where one cell is
 #   missing, as in torch; or the missing cell is passed over, as with nanmax.
-# Reality: neither. ONNX Runtime returns a number that is often not the largest of the others: the
-#   missing cell takes with it the cells that were compared in the same lane before. Of a pad whose
-#   cells read 0 to 7, cell 1 missing, the largest is 6, though cell 7 is there and reads 7. It
-#   depends on the place of the missing cell, and only at place 0 the answer is NaN. A guard that
-#   waits for NaN behind such a model does not see it, and a limit on the load is passed unseen.
+# Reality: neither. ONNX Runtime returns a number that can be less than the largest of the others:
+#   a missing cell can hide one that is there. Of a pad whose cells read 0 to 7, cell 1 missing, the
+#   largest is 6, though cell 7 reads 7. It depends on the place of the missing cell; of the eight
+#   places only the first gives NaN. A guard that waits for NaN behind such a model does not see
+#   it, and a limit on the load is passed unseen.
 # Packages: torch==2.13.0 (Python 3.11: a build for CPUs), onnx==1.23.2, onnxscript==0.7.2,
-#   onnxruntime==1.31.1, numpy==2.4.6
+#   onnxruntime==1.31.1, numpy==2.4.6; on x86-64
 set -eu
 work=$(mktemp -d)
 trap 'rm -rf "$work"' EXIT

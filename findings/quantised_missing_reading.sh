@@ -7,7 +7,7 @@
 #   that was trained to bear missing cells meets a full load in their place once torch quantises
 #   it. No error, no warning about the reading, and none of the three keeps the NaN.
 # Packages: torch==2.13.0 (Python 3.11: a build for CPUs), onnx==1.23.2, onnxscript==0.7.2,
-#   onnxruntime==1.31.1, numpy==2.4.6
+#   onnxruntime==1.31.1, numpy==2.4.6; on x86-64
 set -eu
 work=$(mktemp -d)
 trap 'rm -rf "$work"' EXIT

@@ -14,7 +14,7 @@ INSTALL = $(BIN)/python -m pip install --quiet --no-compile --disable-pip-versio
 CONSTRAINTS := -c constraints.txt
 PACKAGES := $(wildcard packages/*)
 
-.PHONY: demo test test-all test-cpus check quick-tests all-tests examples benchmark docs wheel-check lerobot-check test-pythons install-dev format clean
+.PHONY: demo test test-all test-cpus check quick-tests all-tests examples benchmark docs wheel-check lerobot-check findings test-pythons install-dev format clean
 
 demo: .venv/installed
 	$(BIN)/adaptfault demo
@@ -73,6 +73,10 @@ lerobot-check:
 	test -e build/lerobot/bin/python || $(PYTHON) -m venv build/lerobot
 	build/lerobot/bin/python -m pip install --quiet --disable-pip-version-check '.[datasets]' lerobot==0.4.4
 	build/lerobot/bin/python tests/check_lerobot.py
+
+# Each installs what it names from PyPI; one after the other, and all of them although one fails.
+findings:
+	@failed=0; for one in findings/*.sh; do echo "$$one"; sh "$$one" || failed=1; done; exit $$failed
 
 # With the newest of all packages, on each other Python that is found and runs. On Linux torch brings 6 GB for each.
 test-pythons:

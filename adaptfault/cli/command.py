@@ -46,6 +46,7 @@ def option(help: str, metavar: str | None = None, **how: Any) -> Any:
     Args:
         help, metavar: as argparse takes them.
         how: more of it, and where the option stands: ``flag`` instead of the name of the field,
+            ``short``: its letter,
             ``section``: attribute of the command with the title of the section, ``if_``: attribute
             that says whether the command has it at all, ``last``: behind the others.
     """
@@ -83,7 +84,7 @@ class Command:
 
     command: str
     json: bool = option("print the result as JSON")
-    quiet: bool = option("no progress on stderr")
+    quiet: bool = option("no progress on stderr", short="-q")
     left_out: int = field(default=0, init=False)
     untold: bool = field(default=False, init=False)
 
@@ -230,7 +231,7 @@ class Foreign(Command):
         return int(self.args.run(self.args))
 
 
-_OURS = ("flag", "section", "if_", "describes", "positional", "last")
+_OURS = ("flag", "short", "section", "if_", "describes", "positional", "last")
 
 
 def _add(place: Any, one: Field[Any], hint: Any) -> None:
@@ -256,4 +257,5 @@ def _add(place: Any, one: Field[Any], hint: Any) -> None:
         place.add_argument(one.name, **how)
     else:
         flag = one.metadata.get("flag", f"--{one.name.replace('_', '-')}")
-        place.add_argument(flag, dest=one.name, **how)
+        short = [one.metadata["short"]] if "short" in one.metadata else []
+        place.add_argument(*short, flag, dest=one.name, **how)

@@ -53,6 +53,10 @@ class Parser(argparse.ArgumentParser):
             later(self)
 
     def parse_known_args(self, *args: Any, **options: Any) -> Any:
-        """Parse, with the options of this command alone."""
+        """Parse, with the options of this command alone; what it does not know is refused here,
+        with the usage of this command."""
         self.fill()
-        return super().parse_known_args(*args, **options)
+        known, unknown = super().parse_known_args(*args, **options)
+        if unknown:
+            self.error(f"unrecognized arguments: {' '.join(unknown)}")
+        return known, unknown

@@ -154,5 +154,9 @@ def untested(diagnosis: Diagnosis) -> str | None:
     share = diagnosis.coverage.test_coverage
     if share < UNTESTED:
         return f"only {share:.0%} of the cells were tested, so faults may be hidden"
-    throughout = [fault.reason for fault in diagnosis.possible if fault.recordings is None]
-    return "; ".join(throughout) or None
+    throughout = [fault.cells for fault in diagnosis.possible if fault.recordings is None]
+    cells = {cell for some in throughout for cell in some}
+    if not cells:
+        return None
+    which = "1 cell" if len(cells) == 1 else f"{len(cells)} cells"
+    return f"{which} may be faulty all through the log, which alone cannot tell"

@@ -464,6 +464,29 @@ def test_wrong_usage_is_exit_code_3(capsys):
     assert "usage: adaptfault" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("words", [["info", "x.csv"], ["fleet", "maintain", "robots.toml"]])
+def test_an_option_that_a_command_does_not_have_is_refused_with_the_usage_of_the_command(
+    words, capsys
+):
+    with pytest.raises(SystemExit) as stop:
+        main([*words, "--colour", "red"])
+    assert stop.value.code == 3
+    command = " ".join(one for one in words if "." not in one)
+    told = capsys.readouterr().err
+    assert told.startswith(f"usage: adaptfault {command} [-h]")
+    assert f"adaptfault {command}: error: unrecognized arguments: --colour red" in told
+
+
+def test_quiet_has_a_letter(tmp_path, capsys):
+    log = tmp_path / "a.csv"
+    log.write_text("c0,c1\n" + "0,100\n100,0\n200,500\n" * 9)
+    told = []
+    for quiet in ("--quiet", "-q"):
+        assert main(["diagnose", str(log), "--shape", "1x2", quiet]) in (0, 1, 2)
+        told.append(capsys.readouterr())
+    assert told[0] == told[1]
+
+
 def numeric_options(
     parser: argparse.ArgumentParser, command: tuple[str, ...] = ()
 ) -> Iterator[tuple[str, ...]]:

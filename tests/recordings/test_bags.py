@@ -17,6 +17,7 @@ typesys = pytest.importorskip("rosbags.typesys")
 
 STORAGES = ("MCAP", "SQLITE3")
 MULTI = "std_msgs/msg/Float32MultiArray"
+BYTES = "std_msgs/msg/ByteMultiArray"
 STATE = "tactile_msgs/msg/TactileState"
 rng = np.random.default_rng(0)
 
@@ -127,6 +128,17 @@ def test_the_channels_of_a_tactile_state_are_put_one_after_another(tmp_path):
     )
     assert "holds sensors.values, status; give --field" in refusal(bag)
     np.testing.assert_array_equal(load(bag, field="sensors.values").recordings.frames[0], values)
+
+
+@pytest.mark.parametrize("is_described", [True, False])
+def test_bytes_have_no_sign_as_in_ros_2(tmp_path, is_described):
+    """rosbags reads them with one; see findings/ros2_byte_and_char.sh."""
+    values = np.arange(0, 250, 5, dtype=np.uint8).reshape(10, 5)
+    store = types()
+    messages = [multi_array(store, one.view(np.int8), BYTES) for one in values]
+    storage = "MCAP" if is_described else "SQLITE3"  # version 8 of a .db3 has no definitions
+    bag = write_bag(tmp_path / "t", {"/tactile": (BYTES, messages)}, storage=storage)
+    np.testing.assert_array_equal(load(bag, shape=(1, 1, 5)).recordings.frames[0], values)
 
 
 def test_topic_and_field_are_chosen_and_what_there_is_is_listed(tmp_path):

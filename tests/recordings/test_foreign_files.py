@@ -115,6 +115,55 @@ def test_missing_readings_and_scales_of_cf_are_used(tmp_path):
         check(tmp_path / name, expected=expected)
 
 
+def unsigned_classic(path, stored, **attributes):
+    """Write as netCDF 3 does, which has no type without a sign."""
+    with scipy.io.netcdf_file(path, "w") as file:
+        for name, size in (("time", len(stored)), ("cell", stored.shape[1])):
+            file.createDimension(name, size)
+        kind = f"i{stored.dtype.itemsize}"
+        variable = file.createVariable("tactile", kind, ("time", "cell"))
+        variable[:] = stored.view(kind)
+        for name, value in {"_Unsigned": "true", **attributes}.items():
+            setattr(variable, name, value)
+
+
+def test_numbers_without_a_sign_are_so_in_netcdf(tmp_path):
+    stored = (X % 256).astype(np.uint8)
+    unsigned_classic(tmp_path / "three.nc", stored)
+    unsigned_classic(tmp_path / "wide.nc", (X + 40_000).astype(np.uint16))
+    packing = {"_FillValue": np.int8(-1), "scale_factor": 0.5}
+    unsigned_classic(tmp_path / "scaled.nc", stored, **packing)
+    with h5py.File(tmp_path / "four.h5", "w") as file:
+        file["tactile"] = stored.view(np.int8)
+        file["tactile"].attrs["_Unsigned"] = "true"
+    check(tmp_path / "three.nc", expected=stored)
+    check(tmp_path / "four.h5", expected=stored)
+    check(tmp_path / "wide.nc", expected=X + 40_000)
+    scaled = np.where(stored == 255, np.nan, stored * np.float32(0.5))
+    check(tmp_path / "scaled.nc", expected=scaled)
+
+
+@pytest.mark.parametrize(
+    "limits",
+    [
+        {"valid_range": [100, 3900]},
+        {"valid_min": 100, "valid_max": 3900},
+        {"valid_range": [50.0, 1950.0]},  # of another type than what is stored: of the readings
+    ],
+)
+def test_what_lies_outside_the_valid_range_of_cf_is_missing(tmp_path, limits):
+    stored = X.astype(np.int16)
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["tactile"] = stored
+        file["tactile"].attrs.update({**limits, "scale_factor": 0.5})
+    array = zarr.open_group(tmp_path / "a.zarr", mode="w").create_array("tactile", data=stored)
+    array.attrs.update({**limits, "scale_factor": 0.5})
+    expected = np.where((X < 100) | (X > 3900), np.nan, X / 2)
+    assert np.isnan(expected).any()
+    for name in ("a.zarr", "a.h5"):
+        check(tmp_path / name, expected=expected)
+
+
 def test_netcdf_of_all_versions_is_read(tmp_path):
     with h5py.File(tmp_path / "four.nc", "w") as file:
         file["tactile"] = X.reshape(-1, 3, 4)
@@ -311,6 +360,47 @@ def test_complex_numbers_and_records_are_refused_by_what_they_are(tmp_path):
     with h5py.File(tmp_path / "b.h5", "w") as file:
         file["tactile"] = np.zeros(5, [("time", "f8"), ("cells", "f4", 12)])
     assert "tactile holds records of several fields" in refusal(tmp_path / "b.h5")
+
+
+def test_where_a_file_holds_nothing_else_the_reason_of_what_was_left_out_is_told(tmp_path):
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["log"] = np.zeros(5, [("time", "f8"), ("tactile", "f4", 12)])
+    assert "log holds records of several fields" in refusal(tmp_path / "a.h5")
+    with h5py.File(tmp_path / "b.h5", "w") as file:
+        rows = file.create_dataset("log", 5, h5py.vlen_dtype(np.float32))
+        for frame in range(5):
+            rows[frame] = np.zeros(12)
+    assert "log holds a list a frame" in refusal(tmp_path / "b.h5")
+
+
+def test_frames_and_times_that_belong_to_nothing_are_told(tmp_path):
+    grids = X.reshape(-1, 3, 4)
+    with h5py.File(tmp_path / "ends.h5", "w") as file:
+        file["data/tactile"] = grids
+        file["meta/episode_ends"] = [30, 50]
+    with h5py.File(tmp_path / "times.h5", "w") as file:
+        file["tactile"] = grids
+        file["time"] = np.arange(40) / 50
+    with h5py.File(tmp_path / "pads.h5", "w") as file:
+        file["tactile_left"] = grids[:, :, :2]
+        file["tactile_right"] = grids[:40, :, 2:]
+
+    def told(loaded):
+        return [message.partition(".h5: ")[2] for message in messages(loaded, "warning")]
+
+    ends = load(tmp_path / "ends.h5")
+    assert [len(one) for one in ends.recordings.frames] == [30, 20]
+    assert told(ends) == [
+        "data/tactile: 10 frames behind the last end in meta/episode_ends are left out"
+    ]
+    assert told(load(tmp_path / "times.h5")) == [
+        "time holds 40 values where tactile has 60 frames: passed over"
+    ]
+    pads = load(tmp_path / "pads.h5", layout="2x3x2")
+    assert [len(one) for one in pads.recordings.frames] == [40]
+    assert told(pads) == [
+        "tactile_left holds 60 frames where tactile_right has 40: the last 20 are left out"
+    ]
 
 
 # What declares more than it holds, and what has no end

@@ -101,6 +101,16 @@ def test_cells_of_a_pad_are_told_in_one_sentence_each_with_its_share():
     assert shares == pytest.approx([0.1, 0.2], abs=0.05)
 
 
+def test_diagnose_says_once_what_may_be_faulty_all_through_the_log(tmp_path, capsys):
+    path = tmp_path / "worn.npz"
+    recordings = with_gain(with_gain(contacts(1), [WORN], 0.1), [11], 0.2)
+    save_npz(path, Recordings(tuple(recordings), LAYOUT, np.zeros(len(recordings), np.int64)))
+    assert main(["diagnose", str(path), "--quiet"]) == 1
+    told = capsys.readouterr().out
+    assert told.count("perhaps worn") == 1
+    assert "2 cells may be faulty all through the log, which alone cannot tell" in told
+
+
 def test_what_a_reference_shows_as_usual_is_not_told():
     recordings = with_gain(contacts(2, 48), [WORN], 0.3)
     found = SelfDiagnosis(LAYOUT).fit(recordings[::2]).diagnose(recordings[1::2])

@@ -204,7 +204,7 @@ def _measured_rate(contents: Sequence[Content]) -> tuple[float | None, str]:
     rate = None if elapsed is None else elapsed.rate(tick)
     if rate is None:
         return None, "assumed: no time in the files rises at 2 to 2000 Hz"
-    what = "time column" if clocks[0].text else "times of the messages"
+    what = "time column" if clocks[0].text else "times of the frames"
     more = f" and {len(same) - 1} more" if len(same) > 1 else ""
     return rate, f"{what} of {clocks[0].path.name}{more}"
 

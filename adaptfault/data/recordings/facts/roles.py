@@ -65,6 +65,8 @@ _STATUS = re.compile(r"(?:.*_)?(?:flags?|status|state|valid|checksum|crc(?:8|16|
 
 _SHOWN = 12  # columns in a message
 _DIGITS = re.compile(r"\d+")
+_COLUMN_FIRST = re.compile(r"x.*\*.*y.*\*|c.*\*.*r.*\*", re.IGNORECASE)
+"""Names, with stars for their numbers, of which the first counts columns."""
 
 
 def _last(name: str) -> str:
@@ -179,6 +181,27 @@ def by_family(names: Sequence[str], columns: Sequence[str]) -> list[str]:
     return sorted(names, key=lambda name: stems.index(_DIGITS.sub("*", name)))
 
 
+def in_order(names: Sequence[str], shape: Shape | None = None) -> list[int]:
+    """Return the columns with some names in the order of their numbers, where the file has another
+    one for no reason of the sensor: names that were sorted as text (``c0, c1, c10, c2``), or whose
+    numbers count rows and columns. Each family stays in its own places; others are as they stand.
+
+    Args:
+        names: of columns of readings.
+        shape: ``(pads, rows, cols)`` where it is known; numbers that count others say nothing.
+    """
+    order = list(range(len(names)))
+    for stem, columns in families(names).items():
+        counted = sorted(columns, key=lambda column: _numbers(names[column]))
+        stand = [names[column] for column in columns]
+        grid = None if _COLUMN_FIRST.search(stem) else _grid([names[i] for i in counted])
+        is_grid = grid is not None and (shape is None or grid[1:] == shape[1:])
+        if is_grid or stand == sorted(stand):
+            for place, column in zip(columns, counted, strict=True):
+                order[place] = column
+    return order
+
+
 def left_out(others: Sequence[str], kept: Sequence[str], option: str) -> str:
     """Return the sentence that columns are taken for no readings; "" where there are none."""
     if not others:
@@ -213,9 +236,13 @@ def shape_of(names: Sequence[str]) -> tuple[Shape, str] | None:
     return (len(stems), 1, sizes.pop()), shown
 
 
+def _numbers(name: str) -> tuple[int, ...]:
+    return tuple(map(int, _DIGITS.findall(name)))
+
+
 def _grid(names: Sequence[str]) -> Shape | None:
     """Return pads, rows and columns that two or three numbers in each name count row by row."""
-    numbers = [tuple(map(int, _DIGITS.findall(name))) for name in names]
+    numbers = list(map(_numbers, names))
     axes = list(zip(*numbers, strict=True))
     axes = [axis for axis in axes if len(set(axis)) > 1]
     if len(axes) not in (2, 3):

@@ -67,6 +67,9 @@ class Topic:
             types = get_types_from_msg(definition, self.msgtype) if definition else {}
         store = get_typestore(Stores.EMPTY if self.definition else Stores.ROS2_HUMBLE)
         store.register({name: kind for name, kind in types.items() if name not in store.fielddefs})
+        for name, (constants, fields) in store.fielddefs.items():
+            unsigned = [(field, _without_sign(kind)) for field, kind in fields]
+            store.fielddefs[name] = (constants, unsigned)
         return store
 
     @cached_property
@@ -104,6 +107,17 @@ class Extractor:
     def arrays_of(self, data: bytes) -> list[NDArray[Any]]:
         """Return the arrays of one message; their numbers, one after another, are its readings."""
         return arrays_at(self.topic.deserialize(data), self.field)
+
+
+def _without_sign(kind: Any) -> Any:
+    """Return the type of a field with a byte as the octet that it is in ROS 2: rosbags gives it a
+    sign."""
+    node, inner = kind
+    if inner == ("byte", 0):
+        return node, ("uint8", 0)
+    if isinstance(inner[0], tuple):  # of an array or a sequence
+        return node, (_without_sign(inner[0]), inner[1])
+    return kind
 
 
 def choose(

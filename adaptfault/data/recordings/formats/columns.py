@@ -21,6 +21,7 @@ from adaptfault.data.recordings.facts.roles import (
     SCAN,
     clock_of,
     first_of,
+    in_order,
     is_clock,
     left_out,
     no_readings,
@@ -188,14 +189,20 @@ def _at(names: Sequence[str], name: str | None) -> int | None:
 def _numbered(
     names: Sequence[str], columns: list[int], shape: Shape | None
 ) -> tuple[list[int], tuple[str, ...]]:
-    """Return which of some columns are readings by their names, and a sentence on the others."""
+    """Return which of some columns are readings by their names, in the order of the cells, and
+    sentences on the others and on the order."""
     if not names:
         return columns, ()
     cells = None if shape is None else math.prod(shape)
     kept = [columns[i] for i in readings_of([names[i] for i in columns], cells)]
     others = [names[i] or str(i) for i in columns if i not in kept]
-    told = left_out(others, [names[i] for i in kept], "columns")
-    return kept, ((told,) if told else ())
+    told = [left_out(others, [names[i] for i in kept], "columns")]
+    ordered = [kept[i] for i in in_order([names[i] for i in kept], shape)]
+    if ordered != kept:
+        first = next(i for i, column in enumerate(ordered) if column != kept[i])
+        what = f"{names[ordered[first]]} is read where {names[kept[first]]} stands"
+        told.append(f"columns in the order of their numbers: {what}; otherwise give --columns")
+    return ordered, tuple(filter(None, told))
 
 
 class _Named:

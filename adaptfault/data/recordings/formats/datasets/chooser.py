@@ -111,6 +111,7 @@ class Chooser:
         self._texts: dict[str, list[str]] = {}
         self.divisions: list[Division] = []
         self.left_out = ""
+        self.lost: list[str] = []
 
     def episodes(self, key: str | None) -> list[tuple[str, list[str]]]:
         """Return the group of each episode, and the names of its arrays of readings."""
@@ -174,7 +175,8 @@ class Chooser:
         """Raise the reason why an array that is meant was left out."""
         for name, why in self.contents.left_out.items():
             asked = key is not None and last_part(name) in map(last_part, key.split(","))
-            if asked or (key is None and is_touch(name)):
+            is_all = not self.contents.arrays
+            if asked or (key is None and (is_all or is_touch(name))):
                 raise InputError.at(self.path, f"{name} {why}")
 
     def _sizes(self, name: str) -> Sizes:
@@ -305,6 +307,7 @@ class Chooser:
         if pads.is_guessed:
             told.append(f"{', '.join(part.names)}: {GUESSED}")
         told += [division.lost for division in self.divisions if division.lost]
+        told += dict.fromkeys(self.lost)
         told += self.contents.told
         left_out = list(self.contents.left_out.items())
         told += [f"{name} is left out: it {why}" for name, why in left_out[:_SHOWN]]
@@ -316,7 +319,7 @@ class Chooser:
     def parts(self, episodes: Sequence[tuple[str, list[str]]]) -> Iterator[Part]:
         """Yield the recordings in the arrays of each episode."""
         for place, (group, names) in enumerate(episodes):
-            length = min(self._length(name) for name in names)
+            length = self._common_length(names)
             clock = self._clock(names[0], length)
             classes = self._classes(names[0])
             start = partial(Part, tuple(names), clock=clock, group=group)
@@ -328,6 +331,10 @@ class Chooser:
             column = self._episode_column(names[0], length)
             if self.ends is not None:
                 found = self._bounds(self.ends, length)
+                behind = length - found[-1].last
+                if behind:
+                    what = f"{names[0]}: {behind} frames behind the last end in {self.ends}"
+                    self.lost.append(f"{what} are left out")
             elif column is not None and not group:
                 found = self._runs(column)
             else:
@@ -342,6 +349,17 @@ class Chooser:
                 if episode.part is not None and number is not None:
                     number = f"{number}, part {episode.part}"
                 yield start(episode.first, episode.last, label=episode.label, number=number)
+
+    def _common_length(self, names: Sequence[str]) -> int:
+        """Return how many frames all of some arrays hold."""
+        lengths = {name: self._length(name) for name in names}
+        shortest = min(names, key=lambda name: lengths[name])
+        longest = max(names, key=lambda name: lengths[name])
+        more = lengths[longest] - lengths[shortest]
+        if more:
+            what = f"{longest} holds {lengths[longest]} frames where {shortest} has"
+            self.lost.append(f"{what} {lengths[shortest]}: the last {more} are left out")
+        return lengths[shortest]
 
     def _episode_column(self, name: str, length: int) -> str | None:
         """Return the array that numbers the episode of each row of a table; None without one.
@@ -433,13 +451,20 @@ class Chooser:
         stated = self.stated.clock
         arrays = self.contents.arrays
         near = [one for group in self._groups(name) for one in self._beside.get(group, [])]
+        wrong = []
         for other in near if stated is None else [*near, stated]:
             if stated is None:
                 is_meant = is_clock(last_part(other))
             else:
                 is_meant = f"/{other.lower()}".endswith(f"/{stated.lower()}")
-            if is_meant and other in arrays and is_vector(arrays[other], length):
-                return other
+            if is_meant and other in arrays:
+                if is_vector(arrays[other], length):
+                    return other
+                sizes = arrays[other].shape
+                if len(sizes) == 1 and sizes[0] > 1 and not self.outer:
+                    what = f"{other} holds {sizes[0]} values where {name} has {length} frames"
+                    wrong.append(f"{what}: passed over")
+        self.lost += wrong
         if stated is None or self.outer:
             return None
         raise self._absent("time-column", stated, " of one number a frame")

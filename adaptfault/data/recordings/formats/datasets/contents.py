@@ -171,11 +171,17 @@ class Packing:
     Attributes:
         missing: stored values that stand for a missing reading.
         scale, offset: of the others.
+        limits: what lies outside is a missing reading; of stored values, and where they are no
+            whole numbers but the stored values are, of readings.
+        is_unsigned: whether whole numbers are meant without a sign, whatever their type is: netCDF
+            3 has none without; None: as their type is.
     """
 
     missing: tuple[float, ...] = ()
     scale: float = 1.0
     offset: float = 0.0
+    limits: tuple[float | None, float | None] = (None, None)
+    is_unsigned: bool | None = None
 
     @classmethod
     def of(cls, attributes: Mapping[str, Any]) -> Packing:
@@ -195,7 +201,9 @@ class Packing:
         offset = _stated(attributes, "add_offset", 0.0)
         if scale == 0:
             raise ValueError("scale_factor 0")
-        return cls(known, scale, offset)
+        unsigned = {"true": True, "false": False}
+        sign = str(plain(attributes.get("_Unsigned", ""))).lower()
+        return cls(known, scale, offset, _limits(attributes), unsigned.get(sign))
 
     @property
     def is_scaled(self) -> bool:
@@ -204,14 +212,39 @@ class Packing:
 
     def unpacked(self, stored: NDArray[Any]) -> NDArray[Any]:
         """Return readings; whole numbers keep their type where none is missing."""
-        is_missing = np.isin(stored, self.missing) if self.missing else np.zeros(1, bool)
+        meant = self._with_sign(stored)
+        is_missing = self._is_outside(meant)
+        if self.missing:
+            is_missing |= np.isin(stored, self.missing) | np.isin(meant, self.missing)
         if not self.is_scaled and not is_missing.any():
-            return as_readings(stored)
-        # float64 before the scale: a 32-bit count does not fit float32
-        values = stored.astype(np.float64) * self.scale + self.offset
-        if is_missing.any():
-            values[is_missing] = np.nan
+            return as_readings(meant)
+        values = self._scaled(meant)
+        values[is_missing] = np.nan
         return as_readings(values)
+
+    def _with_sign(self, stored: NDArray[Any]) -> NDArray[Any]:
+        """Return whole numbers with or without the sign that is meant."""
+        if self.is_unsigned is None or stored.dtype.kind not in "iu":
+            return stored
+        kind = "u" if self.is_unsigned else "i"
+        order = stored.dtype.byteorder
+        return stored.view(np.dtype(f"{kind}{stored.dtype.itemsize}").newbyteorder(order))
+
+    def _is_outside(self, meant: NDArray[Any]) -> NDArray[np.bool_]:
+        outside = np.zeros(meant.shape, bool)
+        is_whole = meant.dtype.kind in "iu"
+        of_readings = is_whole and any(isinstance(limit, float) for limit in self.limits)
+        compared = self._scaled(meant) if of_readings and self.is_scaled else meant
+        for limit, is_beyond in zip(self.limits, (np.less, np.greater), strict=True):
+            if limit is not None:
+                wraps = limit < 0 and self.is_unsigned and is_whole and not of_readings
+                end = limit + 2 ** (8 * meant.dtype.itemsize) if wraps else limit
+                outside |= is_beyond(compared, end)
+        return outside
+
+    def _scaled(self, meant: NDArray[Any]) -> NDArray[np.float64]:
+        # float64 before the scale: a 32-bit count does not fit float32
+        return meant.astype(np.float64) * self.scale + self.offset
 
 
 def as_readings(values: NDArray[Any]) -> NDArray[Any]:
@@ -229,6 +262,16 @@ def _stated(attributes: Mapping[str, Any], name: str, usual: float) -> float:
     if not math.isfinite(number):
         raise ValueError(f"{name} {values[0]!r}")
     return number
+
+
+def _limits(attributes: Mapping[str, Any]) -> tuple[float | None, float | None]:
+    """Return the least and the greatest valid value among attributes; None where none is stated."""
+    both = np.asarray(attributes.get("valid_range", ())).ravel().tolist()
+    if len(both) != 2:
+        ends = [attributes.get("valid_min"), attributes.get("valid_max")]
+        both = [next(iter(np.asarray(end).ravel().tolist()), None) for end in ends]
+    least, most = (None if math.isnan(_number(one)) else one for one in both)
+    return least, most
 
 
 def _number(value: Any) -> float:

@@ -96,7 +96,7 @@ def _collect_array(h5py: Any, file: Any, contents: Contents, name: str, found: A
     elif h5py.check_ref_dtype(found.dtype) is not None:
         _add_cells(file, contents, name, found)
     elif is_list and h5py.check_string_dtype(found.dtype) is None:
-        contents.left_out[name] = "holds lists of different lengths; save one array a frame"
+        contents.left_out[name] = "holds a list a frame; save all frames as one array"
     elif found.shape is not None:
         _add(contents, name, found, dict(found.attrs))
 

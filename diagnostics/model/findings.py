@@ -22,6 +22,7 @@ from diagnostics.model.record import Mask
 from diagnostics.model.symbols import NOTHING
 from diagnostics.model.ways import DRIFTS, WAYS
 from diagnostics.model.ways.comes_and_goes import COMES_AND_GOES
+from diagnostics.model.ways.holds import expected
 from diagnostics.preprocessing.levels import CERTAIN_RATIO, DOUBTED, RARE
 
 _SHOWN = 1.0  # evidence that excludes a way to fail, or suggests one
@@ -198,11 +199,12 @@ def shown(judgement: Judgement) -> Mask:
 
 def _weight(judgement: Judgement, holds: Mask) -> Floats:
     """Return the log ratio of each cell, faulty : healthy, ``[D]``; of one that ``holds`` a value
-    (bool) by that alone."""
+    (bool) by that alone. On a broken line this value is no surprise."""
+    observed = judgement.observed
     of_holding = judgement.evidence[[way.kind is None for way in WAYS]].max(axis=0)
+    of_holding = of_holding - expected(observed.log)
     weight = np.where(holds, of_holding, judgement.log_odds).astype(np.float64)
     # where a cell rests that never moved in the reference, or that nothing touches, tells nothing
-    observed = judgement.observed
     tells = observed.log.living & ~observed.unwitnessed.all(axis=0)
     return np.where(tells, weight, np.minimum(weight, 0.0))
 

@@ -13,7 +13,7 @@ from functools import partial
 
 import numpy as np
 
-from diagnostics.model.observed import HELD, Observed
+from diagnostics.model.observed import HELD, Log, Observed
 from diagnostics.model.over_time import Units, for_good, since
 from diagnostics.model.record import Array, Cells
 from diagnostics.model.symbols import MOVES
@@ -35,14 +35,19 @@ def _ratio(observed: Observed, *, dithers: bool) -> Array:
     return found
 
 
-def _evidence(observed: Observed, units: Units, *, dithers: bool) -> Array:
-    log = observed.log
+def expected(log: Log) -> Array:
+    """Return log P(the value at which a cell is stuck) ``[D]``, of the one it holds."""
     rest = log.symbols.rest
     at_rest = np.abs(log.value - rest.level) <= rest.near + log.symbols.tolerance
     tolerance = log.symbols.tolerance
     at_end = (log.value >= rest.full - tolerance) | (log.value <= tolerance)
-    expected = _EXPECTED[(at_rest | at_end).astype(np.intp)]
-    found: Array = for_good(_ratio(observed, dithers=dithers), units) + expected
+    found: Array = _EXPECTED[(at_rest | at_end).astype(np.intp)]
+    return found
+
+
+def _evidence(observed: Observed, units: Units, *, dithers: bool) -> Array:
+    log = observed.log
+    found: Array = for_good(_ratio(observed, dithers=dithers), units) + expected(log)
     return np.where(log.run >= HELD, found, np.minimum(found, 0))
 
 

@@ -36,6 +36,7 @@ from numpy.typing import NDArray
 from scipy.special import ndtri
 from scipy.stats import chi2
 
+from diagnostics.evidence.prediction import OUTLIERS, log_student_t
 from diagnostics.model.symbols import NOTHING, root_load
 from diagnostics.preprocessing.levels import FEWEST, LOW, SLIGHT
 from diagnostics.preprocessing.readings import held
@@ -51,7 +52,6 @@ _FEWEST = 12  # recordings
 _FEWEST_LOADED = 3  # recordings that load a cell: fewer prove no gain
 _SHOWN = 0.1  # root load that is expected, from which on a cell shows its gain
 _RARELY = 0.002  # a cell is loaded, or unloaded, whatever the others say
-OUTLIERS = 0.1  # share of the pieces in which any load is as likely
 _ERRORS = 4.0  # standard errors of the gain in pseudo-likelihood
 # of the correction; share of each correction that is applied: neighbours err together
 _ROUNDS = 4
@@ -387,15 +387,6 @@ class Fit:
         pieces = np.maximum(np.add.reduceat(shown, first, axis=0, dtype=float), 1)
         found = total / np.maximum(weights, np.finfo(float).tiny)
         return found, weights * contacts / pieces
-
-
-def log_student_t(error: Floats, outliers: float) -> Floats:
-    """Return the log density of standardised errors, contaminated by a share of ``outliers``; up to
-    a constant: ``log((1 - outliers) t_4(error) / t_4(0) + outliers)``, as
-    ``scipy.stats.t(4).pdf``."""
-    u = 1 + (error / 2) ** 2
-    found: Floats = np.log((1 - outliers) / (u * u * np.sqrt(u)) + outliers)
-    return found
 
 
 def _ratios(ratio: Floats, precision: Floats) -> tuple[Floats, Floats]:

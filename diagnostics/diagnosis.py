@@ -36,7 +36,7 @@ from diagnostics.model import Model, fit_model
 from diagnostics.model.findings import judged_by_model
 from diagnostics.preprocessing.array_likes import plain_array
 from diagnostics.preprocessing.copies import find_copies
-from diagnostics.preprocessing.levels import LEAST_LOADED, LOW, SLIGHT
+from diagnostics.preprocessing.levels import LEAST_LOADED, LOW, MAJORITY, SLIGHT
 from diagnostics.preprocessing.load import LoadDirection
 from diagnostics.preprocessing.quantiles import known_quantile
 from diagnostics.preprocessing.readings import RecordingBlocks
@@ -65,6 +65,7 @@ from diagnostics.when.reference_findings import (
 )
 
 SCHEMA = "adaptfault.diagnoser/5"
+_LASTS = 8  # frames of a contact, at least
 # kinds that a cell shows however the others move
 _OF_ANY_MOVEMENT = (*HOLDS, FaultKind.ALIAS, FaultKind.NOISY)
 
@@ -800,11 +801,25 @@ def axis_planes(layout: SensorLayout) -> tuple[SensorLayout, NDArray[np.intp]]:
 
 def _shows_contacts(first: RecordingBlocks, log: RecordingBlocks, layout: SensorLayout) -> bool:
     """Return whether most cells are loaded in the ``first`` recordings of a log, by what loads
-    there are in it."""
+    there are in it: loads last, noise does not."""
     present = layout.present.ravel()
-    before = _typical_range(first.valid(layout.full_scale, present), present)
+    given = first.valid(layout.full_scale, present)
+    before = _typical_range(given, present)
     typical = _typical_range(log.valid(layout.full_scale, present), present)
-    return before > SLIGHT * layout.full_scale and before >= LEAST_LOADED * typical
+    lasting = _typical_range(RecordingBlocks([_means(frames) for frames in given]), present)
+    lasts = lasting >= MAJORITY * before
+    return lasts and before > SLIGHT * layout.full_scale and before >= LEAST_LOADED * typical
+
+
+def _means(frames: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the means of pieces of a recording ``[T, D]``, without missing readings; of a short
+    one, its frames."""
+    pieces = len(frames) // _LASTS
+    if pieces < 2:
+        return frames
+    parts = frames[: pieces * _LASTS].reshape(pieces, _LASTS, -1)
+    count = np.isfinite(parts).sum(axis=1)
+    return np.where(count > 0, np.nansum(parts, axis=1) / np.maximum(count, 1), np.nan)
 
 
 def _typical_range(recordings: RecordingBlocks, present: NDArray[np.bool_]) -> float:

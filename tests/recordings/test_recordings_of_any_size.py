@@ -43,7 +43,7 @@ def written(folder, log, kind):
         case "counts":
             np.save(folder / "a.npy", np.nan_to_num(log * 819).astype(np.uint16))
         case "several":
-            np.save(folder / "a.npy", log[: len(log) // 100 * 100].reshape(-1, 100, 220))
+            np.save(folder / "a.npy", log[:1500].reshape(-1, 100, 220))
         case "by column":
             np.save(folder / "a.npy", np.asfortranarray(log))
         case "csv":

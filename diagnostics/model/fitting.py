@@ -50,6 +50,7 @@ _LEFT_OUT = (
 )  # shares of the cells that the network goes without
 _EXAMPLES = 400_000  # of the network
 _JOINED = 0.05  # of the pieces: another recording goes before, as in a log of joined ones
+_BEGINS = 0.1  # of them: a recording begins with it, as one that is cut does
 _UNLOADED = 5  # one in so many pieces in which nothing is loaded
 _LIVES = 1e-5  # of full scale: a range of readings
 _ODD_UNITS = 50.0  # units of all cells that weigh on the share of one
@@ -266,7 +267,8 @@ def _examples(
             before = np.where(joined, rng.choice(mine, len(chosen)), chosen - 1)
             in_turn = np.stack([before, chosen], axis=1).ravel()
             first = np.ones(len(in_turn), bool)
-            first[1::2] = record.first[chosen] & ~joined
+            begins = record.first[chosen] | (rng.random(len(chosen)) < _BEGINS)
+            first[1::2] = begins & ~joined
             told = load[in_turn]
             found = predictor.inputs(told, told, first, known)[1::2, cells]
             inputs.append(found.reshape(-1, found.shape[-1]))

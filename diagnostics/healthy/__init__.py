@@ -1,0 +1,2 @@
+"""The healthy model: what a healthy cell reads in a contact event, given the readings of the other
+cells."""

@@ -52,10 +52,11 @@ def test_frames_that_an_idle_array_repeats_are_no_repeated_frames(grasps):
 
 
 def test_a_healthy_log_that_repeats_frames_is_told_so_and_blames_nobody(grasps):
-    log = [np.repeat(frames, 4, axis=0) for frames in grasps[16:]]
+    reference = grasps[::2]
+    log = [np.repeat(frames, 4, axis=0) for frames in grasps[1::2]]
     with rough_fit():
-        fitted = SelfDiagnosis(LAYOUT).fit(grasps[:16])
-        found = af.inspect(log, fitted, reference=grasps[:16])
+        fitted = SelfDiagnosis(LAYOUT).fit(reference)
+        found = af.inspect(log, fitted, reference=reference)
     told = {finding.name: finding for finding in found.findings}
     assert "75% of the frames repeat" in told["repeated_frames"].reason
     assert "come about 5 times a second" in told["repeated_frames"].reason

@@ -78,7 +78,7 @@ def rests(rng: np.random.Generator) -> tuple[float, float]:
 @pytest.fixture(scope="module")
 def of_pads() -> SelfDiagnosis:
     rng = np.random.default_rng(0)
-    healthy = [recording(rng, (0.25, 0.0)), *(recording(rng, rests(rng)) for _ in range(29))]
+    healthy = [recording(rng, (0.25, 0.0)), *(recording(rng, rests(rng)) for _ in range(59))]
     with rough_fit():
         return SelfDiagnosis(PADS).fit(healthy)
 

@@ -1,7 +1,7 @@
 """The monitor for the microcontroller, in Python: what ``monitor.c`` computes, integer by integer.
 
 A reading is a whole count, or missing. For each frame and cell, with ``d`` the dither, ``w`` the
-number of predictors that have to move:
+number of predictors that have to move::
 
     run       frames since the readings of the cell left a range of ``d`` last
     seen      fresh frames of the run in which ``w`` of the cell's predictors left theirs

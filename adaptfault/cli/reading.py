@@ -190,7 +190,7 @@ class Reading(CalibratedArray):
         Args:
             paths: files and folders.
             layout: as for :meth:`load`.
-            select: as for :func:`adaptfault.data.recordings.load.open_recordings`.
+            select: as for ``adaptfault.data.recordings.open_recordings``.
 
         Raises:
             ValueError: nothing could be read, or an option contradicts ``layout``.

@@ -754,10 +754,11 @@ def _of_any_movement(found: Diagnosis, suspect: NDArray[np.bool_]) -> Diagnosis:
             told.append(fault)
         else:
             unknown[list(fault.cells)] = True
+    doubted = np.minimum(found.probability, MAJORITY)
     return replace(
         found,
         faults=tuple(told),
-        probability=np.where(unknown, np.minimum(found.probability, 0.5), found.probability),
+        probability=np.where(unknown, doubted, found.probability),
         tested=found.tested & ~unknown,
     )
 

@@ -7,7 +7,7 @@ import os
 import shutil
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -347,22 +347,22 @@ def all_trees(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @contextmanager
-def rough_fit() -> Iterator[None]:
+def _fit_of(steps: int, logs: int) -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("diagnostics.model.predictor._STEPS", steps)
+        patch.setattr("diagnostics.model.fitting._LOGS", logs)
+        yield
+
+
+def rough_fit() -> AbstractContextManager[None]:
     """Let a fit take fewer steps and judge fewer logs, which take most of its time, where accuracy
     is not what is proven."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("diagnostics.model.predictor._STEPS", 200)
-        patch.setattr("diagnostics.model.fitting._LOGS", 8)
-        yield
+    return _fit_of(200, 8)
 
 
-@contextmanager
-def whole_fit() -> Iterator[None]:
+def whole_fit() -> AbstractContextManager[None]:
     """Let a fit take all its steps and judge all its logs, where its accuracy is what is proven."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("diagnostics.model.predictor._STEPS", _STEPS)
-        patch.setattr("diagnostics.model.fitting._LOGS", _LOGS)
-        yield
+    return _fit_of(_STEPS, _LOGS)
 
 
 @pytest.fixture(scope="session", autouse=True)

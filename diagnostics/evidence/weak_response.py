@@ -84,16 +84,17 @@ class WeakResponse:
     @property
     def follows(self) -> NDArray[np.bool_]:
         """The cells that move with those around them, bool ``[D]``."""
-        together = np.sqrt(self.readings * self.loads)
-        return np.asarray((together > 0) & (self.products >= _FOLLOWS * together))
+        return self._correlate(_FOLLOWS)
 
     def untestable(self, near: float) -> NDArray[np.bool_]:
         """Return the cells that work and respond by at most ``near``, bool ``[D]``."""
-        follows = self.products * np.sqrt(self.frames) > _CERTAIN * np.sqrt(
-            self.readings * self.loads
-        )
+        certain = _CERTAIN / np.sqrt(max(1, self.frames))
         weak = self.products * self.highest <= near * self.loads
-        return np.asarray(follows & weak)
+        return self._correlate(certain) & weak
+
+    def _correlate(self, least: float) -> NDArray[np.bool_]:
+        """Return the cells whose correlation with those around exceeds ``least``, bool ``[D]``."""
+        return np.asarray(self.products > least * np.sqrt(self.readings * self.loads))
 
 
 def _mean_of_neighbours(loads: Floats, layout: SensorLayout) -> Floats:

@@ -369,13 +369,13 @@ class Model:
     def _odd_as_a_whole(self, observed: Observed, refuted: Mask, alone: Mask) -> Mask:
         """Return the cells of pads of which many that move ``alone`` are ``refuted``, bool ``[D]``
         each; all cells, where that holds of the array, or trusted ones are odd in many units."""
+        whole = refuted.sum() >= _FEWEST and refuted.sum() > _DISTURBED * alone.sum()
+        odd = observed.odd[:, observed.known].mean(axis=0)
+        strange = len(odd) >= _FEWEST and np.quantile(odd, _MOST_CELLS) > _STRANGE * USUAL
+        if whole or strange:
+            return np.ones_like(refuted)
         of_pad = self.predictor.on_pad(np.stack([refuted, alone]).astype(np.float32))
         many: Mask = (of_pad[0] >= _FEWEST) & (of_pad[0] > _DISTURBED * of_pad[1])
-        if refuted.sum() >= _FEWEST and refuted.sum() > _DISTURBED * alone.sum():
-            many[:] = True
-        odd = observed.odd[:, observed.known].mean(axis=0)
-        if len(odd) >= _FEWEST and np.quantile(odd, _MOST_CELLS) > _STRANGE * USUAL:
-            many[:] = True
         return many
 
 

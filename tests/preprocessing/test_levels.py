@@ -5,6 +5,7 @@ import pytest
 from conftest import rough_fit
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from round_contacts import presses
 
 from diagnostics import SelfDiagnosis, SensorLayout
 from diagnostics.preprocessing.levels import LIGHT
@@ -13,21 +14,6 @@ from diagnostics.preprocessing.offset import levelled, levels
 LAYOUT = SensorLayout(1, 8, 8, full_scale=4095, unit="count", rate=20.0)
 PRESENT = np.ones(64, bool)
 GAIN = np.random.default_rng(7).uniform(0.4, 1.0, 64)  # of each cell
-
-
-def presses(seed: int, count: int = 48) -> list[np.ndarray]:
-    """One or two round contacts in each recording, that come and go."""
-    rng = np.random.default_rng(seed)
-    row, column = np.divmod(np.arange(64), 8)
-    swell = np.clip(np.minimum(np.arange(80) - 10, 65 - np.arange(80)) / 4, 0, 1)[:, None]
-    recordings = []
-    for _ in range(count):
-        load = np.zeros(64)
-        for _ in range(rng.integers(1, 3)):
-            squared = (row - rng.uniform(0, 7)) ** 2 + (column - rng.uniform(0, 7)) ** 2
-            load += rng.uniform(600, 2500) * np.exp(-squared / 2 / rng.uniform(0.8, 1.8) ** 2)
-        recordings.append(np.clip(np.rint(40 + swell * load + rng.normal(0, 2, (80, 64))), 0, 4095))
-    return recordings
 
 
 def lifted(

@@ -46,8 +46,8 @@ _SURE = 0.95
 
 
 class Verdict(IntEnum):
-    """Verdict on one cell. UNTESTED is neither healthy nor faulty: no event of the log tested the
-    cell."""
+    """Verdict on one cell. UNTESTED is neither healthy nor faulty: no event of the log, or none of
+    its later half, tested the cell."""
 
     ALIVE = 0
     FAULTY = 1

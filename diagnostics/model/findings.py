@@ -189,10 +189,16 @@ def findings(
 
 
 def shown(judgement: Judgement) -> Mask:
-    """Return the cells that follow the others as a healthy one does, bool ``[D]``: they do not move
-    by themselves, no way to fail is near, and their line works."""
+    """Return the cells that follow the others as a healthy one does, bool ``[D]``, in the later
+    half of the log as well: they do not hold one value there nor move by themselves, no way to
+    fail is near, and their line works."""
+    observed = judgement.observed
+    units = judgement.units
+    later_half = len(observed.log.record) - units.begins[len(units.begins) // 2]
+    lately = [way.lately(observed, units) for way in WAYS if way.lately is not None]
+    follows = (np.array(lately) < -_SHOWN).all(axis=0) & (observed.log.run < later_half)
     floats = [way.kind is FaultKind.FLOATING for way in WAYS]
-    follows = (judgement.evidence[floats] < -_SHOWN).all(axis=0)
+    follows &= (judgement.evidence[floats] < -_SHOWN).all(axis=0)
     found: Mask = follows & (judgement.evidence.max(axis=0) < _SHOWN) & ~judgement.failing.doubted
     return found
 

@@ -24,7 +24,8 @@ HELD = 3  # pieces at the end at one load: it may be stuck
 _STAYS = 0.05  # of a root load, or of those of a pad: a smaller change is none
 _LIGHT = 1  # level up to which a load is no witness of a contact
 _ODD = 8.0  # nats of a unit beyond those expected
-_LOOKS = np.log([[0.95, 0.03, 0.02], [0.1, 0.88, 0.02]])  # of a held value without and with dither
+# of a held value without and with dither
+_LOOKS = np.log([[0.99, 0.007, 0.003], [0.1, 0.88, 0.02]])
 _USUALLY = 8.0  # cells that the usual look of a piece is worth
 _LEAST = 1e-6  # probability whose logarithm is taken
 

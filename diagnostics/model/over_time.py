@@ -84,6 +84,12 @@ def throughout(ratio: Array, units: Units) -> Array:
     return _unless_gone(of_units.sum(axis=0), of_units, units.goes)
 
 
+def since_middle(ratio: Array, units: Units) -> Array:
+    """Return the evidence ``[D]`` of a fault in the later half of a log."""
+    found: Array = units.of_units(ratio)[len(units.begins) // 2 :].sum(axis=0)
+    return found
+
+
 def _since_each(ratio: Array, units: Units) -> Array:
     """Return the evidence ``[n, D]`` of a fault from each piece on."""
     sums = _from_here(ratio)

@@ -12,7 +12,7 @@ import numpy as np
 
 from diagnostics.faults import FaultKind
 from diagnostics.model.observed import Observed
-from diagnostics.model.over_time import USUAL, Units, throughout
+from diagnostics.model.over_time import USUAL, Units, for_good
 from diagnostics.model.record import Array, Cells
 from diagnostics.model.ways.way import MISS, Way
 
@@ -33,7 +33,7 @@ def _of(observed: Observed, units: Units, source: Array, above: Array, given: Ar
     same = np.log(1 - MISS) - log.agree - observed.of_level
     ratio = np.where(away <= log.symbols.tolerance, same, np.log(MISS))
     told = loaded & observed.tells & np.isfinite(source)
-    evidence = throughout(np.where(told, ratio, 0), units)
+    evidence = for_good(np.where(told, ratio, 0), units)
     # one of the two is the copy: what makes the other one it is as if this one were healthy
     expected = np.where(told, given - observed.of_level, 0).sum(axis=0)
     this = evidence - np.logaddexp(0, -expected)

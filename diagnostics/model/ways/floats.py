@@ -16,7 +16,7 @@ import numpy as np
 
 from diagnostics.faults import FaultKind
 from diagnostics.model.observed import Observed
-from diagnostics.model.over_time import Units, for_good, since
+from diagnostics.model.over_time import Units, for_good, since, since_middle
 from diagnostics.model.record import Array, Cells
 from diagnostics.model.symbols import MOVES
 from diagnostics.model.ways.way import Way, asked_once
@@ -59,4 +59,8 @@ def _since(observed: Observed, units: Units) -> Cells:
     return since(_ratio(observed), units)
 
 
-FLOATS = Way(FaultKind.FLOATING, 0.2, _evidence, _since)
+def _lately(observed: Observed, units: Units) -> Array:
+    return since_middle(_ratio(observed), units)
+
+
+FLOATS = Way(FaultKind.FLOATING, 0.2, _evidence, _since, lately=_lately)

@@ -11,14 +11,21 @@ import numpy as np
 
 from diagnostics.faults import FaultKind
 from diagnostics.model.observed import Observed
-from diagnostics.model.over_time import Units, throughout
-from diagnostics.model.record import Array
+from diagnostics.model.over_time import Units, for_good, since
+from diagnostics.model.record import Array, Cells
 from diagnostics.model.ways.way import Way
 
 
+def _ratio(observed: Observed, lag: int) -> Array:
+    return (observed.delayed(lag) - observed.of_level) * observed.tells
+
+
 def _evidence(observed: Observed, units: Units, *, lag: int) -> Array:
-    ratio = observed.delayed(lag) - observed.of_level
-    return throughout(ratio * observed.tells, units)
+    return for_good(_ratio(observed, lag), units)
+
+
+def _since(observed: Observed, units: Units, *, lag: int) -> Cells:
+    return since(_ratio(observed, lag), units)
 
 
 def _value(observed: Observed, *, lag: int) -> Array:
@@ -32,6 +39,7 @@ def _way(lag: int) -> Way:
         FaultKind.LATE,
         0.05,
         partial(_evidence, lag=lag),
+        partial(_since, lag=lag),
         value=partial(_value, lag=lag),
         decides=False,
     )

@@ -320,13 +320,14 @@ class Chooser:
         """Yield the recordings in the arrays of each episode."""
         for place, (group, names) in enumerate(episodes):
             length = self._common_length(names)
+            written = self._written(names, length)
             clock = self._clock(names[0], length)
             classes = self._classes(names[0])
             start = partial(Part, tuple(names), clock=clock, group=group)
             if self.outer:
                 for i, frames in enumerate(self._lengths(names[0])):
                     label = classes.of_recording(i, length)
-                    yield start(0, frames, outer=i, clock=None, label=label)
+                    yield start(0, frames if i < written else 0, outer=i, clock=None, label=label)
                 continue
             column = self._episode_column(names[0], length)
             if self.ends is not None:
@@ -336,9 +337,9 @@ class Chooser:
                     what = f"{names[0]}: {behind} frames behind the last end in {self.ends}"
                     self.lost.append(f"{what} are left out")
             elif column is not None and not group:
-                found = self._runs(column)
+                found = self._runs(column, written)
             else:
-                found = [Episode(0, length)]
+                found = [Episode(0, written)]
             is_group = len(found) == 1 and found[0].number is None
             first = place if is_group else 0
             count = len(episodes) if is_group else len(found)
@@ -348,7 +349,9 @@ class Chooser:
                 number = episode.number
                 if episode.part is not None and number is not None:
                     number = f"{number}, part {episode.part}"
-                yield start(episode.first, episode.last, label=episode.label, number=number)
+                first = min(episode.first, written)
+                last = min(episode.last, written)
+                yield start(first, last, label=episode.label, number=number)
 
     def _common_length(self, names: Sequence[str]) -> int:
         """Return how many frames all of some arrays hold."""
@@ -360,6 +363,19 @@ class Chooser:
             what = f"{longest} holds {lengths[longest]} frames where {shortest} has"
             self.lost.append(f"{what} {lengths[shortest]}: the last {more} are left out")
         return lengths[shortest]
+
+    def _written(self, names: Sequence[str], length: int) -> int:
+        """Return how many of the frames that all of some arrays hold there are up to the last that
+        was written; of recordings where the first axis counts these."""
+        ends = [self.contents.written[name] for name in names if name in self.contents.written]
+        if not ends:
+            return length
+        written = min(length, *(end[-1] if self.is_turned else end[0] for end in ends))
+        if written < length:
+            what = "recordings" if self.outer else "frames"
+            never = f"the last {length - written} {what} were never written"
+            self.lost.append(f"{names[0]}: {never}, and are left out")
+        return written
 
     def _episode_column(self, name: str, length: int) -> str | None:
         """Return the array that numbers the episode of each row of a table; None without one.
@@ -411,10 +427,10 @@ class Chooser:
         bounds = enumerate(pairwise([0, *ends.tolist()]))
         return [Episode(first, last, number) for number, (first, last) in bounds]
 
-    def _runs(self, name: str) -> list[Episode]:
-        """Return the episodes that a column numbers."""
+    def _runs(self, name: str, length: int) -> list[Episode]:
+        """Return the episodes that a column numbers up to some frame."""
         array = self.contents.arrays[name]
-        stored = np.asarray(array[:]).ravel()
+        stored = np.asarray(array[:]).ravel()[:length]
         if array.dtype.kind in TEXTS:
             stored = np.array(texts(stored))
         if stored.dtype.kind == "f" and not np.isfinite(stored).all():

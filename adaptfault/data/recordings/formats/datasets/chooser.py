@@ -30,9 +30,10 @@ from adaptfault.data.recordings.facts.roles import (
     COUNTERS,
     EPISODES,
     LABELS,
-    by_family,
+    in_order,
     is_clock,
     left_out,
+    reordered,
     shape_of,
     unit_of,
 )
@@ -110,7 +111,7 @@ class Chooser:
                 self._beside.setdefault(name.rpartition("/")[0], []).append(name)
         self._texts: dict[str, list[str]] = {}
         self.divisions: list[Division] = []
-        self.left_out = ""
+        self.by_names: list[str] = []
         self.lost: list[str] = []
 
     def episodes(self, key: str | None) -> list[tuple[str, list[str]]]:
@@ -131,8 +132,10 @@ class Chooser:
         if key is None and chosen and not any(features.get(name) for name in chosen):
             others = [name for name in features if name not in chosen and not features[name]]
             in_file = by_episode(list(listed)).values()
-            chosen = by_family(chosen, [name for names in in_file for name in names])
-            self.left_out = left_out(others, chosen, "key")
+            every = dict.fromkeys(name for names in in_file for name in names)
+            stand = [name for name in every if name in chosen]
+            chosen = [stand[i] for i in in_order(stand, self.shape)]
+            self.by_names = [left_out(others, chosen, "key"), reordered(stand, chosen, "key")]
         found = [
             (episode, [names[common] for common in chosen])
             for episode, names in grouped.items()
@@ -278,7 +281,7 @@ class Chooser:
         whole = all(contents.arrays[one].dtype.kind in "iu" for one in part.names)
         are_cells = len(part.names) > 1 and not any(map(self._sizes, part.names))
         by_name = shape_of(part.names) if are_cells and self.shape is None else None
-        told = [self.left_out, *(division.inferred for division in self.divisions)]
+        told = [*self.by_names, *(division.inferred for division in self.divisions)]
         return Facts(
             self.path,
             counts=whole and not any(one.is_scaled for one in packings),

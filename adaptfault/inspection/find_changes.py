@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from adaptfault.inspection.changed_readings import ChangedReadings, Frames
 from diagnostics import Diagnosis, FaultKind, FaultSet, SelfDiagnosis
-from diagnostics.preprocessing.levels import EXPECTED, LEAST_LOADED
+from diagnostics.preprocessing.levels import EXPECTED, LEAST_LOADED, MAJORITY
 from diagnostics.sensor.another_sensor import AnotherSensor, find_another_sensor
 from diagnostics.sensor.recalibration import Recalibration, find_recalibration
 from diagnostics.sensor.rewiring import Rewiring
@@ -89,12 +89,14 @@ def _as_own_reference(
     """Return a log of another sensor of which the reference calls so many cells faulty that the
     others do not tell it: it is its own reference. None where most of these are faulty then, too,
     or the log is of the same sensor."""
-    if not as_found.diagnosis.fault_set:
+    layout = diagnoser.layout
+    explained = _explained(as_found.diagnosis)[layout.present.ravel()]
+    if not as_found.diagnosis.fault_set or explained.mean() <= MAJORITY / 2:
         return None
     another = _another(diagnoser, as_found, healthy, with_faulty=True)
     if another is None or not another.is_whole:
         return None
-    own = SelfDiagnosis(diagnoser.layout).diagnose(as_found.frames)
+    own = SelfDiagnosis(layout).diagnose(as_found.frames)
     diagnosis = _on_pads(as_found.diagnosis, own, another.pads)
     if diagnosis.n_lost > as_found.diagnosis.n_lost / 2:
         return None
@@ -122,6 +124,12 @@ def _on_pads(diagnosis: Diagnosis, own: Diagnosis, pads: Sequence[int]) -> Diagn
     )
 
 
+def _explained(diagnosis: Diagnosis) -> NDArray[np.bool_]:
+    """Return the cells, bool ``[D]``, that faults or objects explain: another sensor is told by
+    those that are left."""
+    return _faulty(diagnosis) | diagnosis.disturbed.mask
+
+
 def _another(
     diagnoser: SelfDiagnosis,
     as_found: ChangedReadings,
@@ -143,7 +151,7 @@ def _another(
         return None
     diagnosis = as_found.diagnosis
     frames = diagnoser.without_gain(as_found.frames) or as_found.frames
-    excluded = _faulty(diagnosis) | diagnosis.disturbed.mask
+    excluded = _explained(diagnosis)
     if with_faulty:
         excluded = np.ptp(np.concatenate(frames), axis=0) == 0
     return find_another_sensor(

@@ -1,6 +1,7 @@
 """Text files as people and instruments write them: separators, preambles, encodings, matrices."""
 
 import json
+import os
 import re
 from pathlib import Path
 
@@ -677,3 +678,37 @@ def test_a_class_that_changes_all_the_time_is_told_with_what_is_lost(tmp_path):
     (told,) = messages(loaded, "warning")
     assert "the class changes 39 times within a recording" in told
     assert "that of 20 of 60 frames is lost" in told
+
+
+@pytest.mark.parametrize(
+    ("content", "told"),
+    [
+        ("1," * 1_500_000, "line 1: holds over 1,000,000 numbers"),
+        ("c0,c1\n" + "1 " * 1_500_000 + "\n", "line 2: holds over 1,000,000 numbers"),
+        ("1" * 3000, "line 1: is over 2,000 bytes long"),
+    ],
+)
+def test_a_line_that_is_longer_than_any_frame_is_named_and_the_others_are_read(
+    tmp_path, monkeypatch, content, told
+):
+    if len(content) < 10_000:
+        monkeypatch.setattr("adaptfault.data.recordings.formats.dialect.LONGEST_LINE", 2000)
+        monkeypatch.setattr("adaptfault.data.recordings.formats.dialect._CHUNK", 500)
+    (tmp_path / "a.csv").write_text(content)
+    np.save(tmp_path / "good.npy", VALUES.astype(np.float32))
+    loaded = load(tmp_path, layout="1x6")
+    assert len(loaded.recordings) == 1
+    (error,) = [problem for problem in loaded.problems if problem.level == "error"]
+    assert told in error.message
+
+
+def test_what_is_no_file_is_named_and_passed_over(tmp_path):
+    np.save(tmp_path / "good.npy", VALUES.astype(np.float32))
+    os.mkfifo(tmp_path / "pipe.csv")
+    (tmp_path / "zero.npz").symlink_to("/dev/zero")
+    loaded = load(tmp_path, layout="1x6")
+    assert len(loaded.recordings) == 1
+    told = [problem.message for problem in loaded.problems]
+    assert all("is a pipe, a device or a socket" in message for message in told)
+    names = sorted(message.partition(":")[0].rpartition("/")[2] for message in told)
+    assert names == ["pipe.csv", "zero.npz"]

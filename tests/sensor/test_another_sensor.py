@@ -170,3 +170,10 @@ def test_exchanged_wires_and_dead_cells_of_the_own_pad_are_no_other_pad(fitted_t
     found = af.inspect(held, fitted_to_slides, reference=slid)
     assert "another_sensor" not in {finding.name for finding in found.findings}
     assert len(set(found.diagnosis.fault_set) & set(dead.tolist())) >= 20
+    rest = np.random.default_rng(OWN).uniform(20, 60, 63)
+    worn = {16, 17, 24, 46}
+    gain = np.where(np.isin(np.arange(63), [*worn]), 0.1, 1.0)
+    weak = [np.rint(rest + gain * (one - rest)) for one in own]
+    found = af.inspect(weak, fitted_to_slides, reference=slid)
+    assert "another_sensor" not in {finding.name for finding in found.findings}
+    assert set(found.diagnosis.fault_set) == worn

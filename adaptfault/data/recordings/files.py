@@ -113,6 +113,9 @@ def _below(root: Path, known: Mapping[str, Reader], problems: list[Problem]) -> 
             reader = reader_of(path, known, is_folder=False)
             if reader is not None and not name.startswith(".") and path.is_file():
                 files.append((path, reader))
+            elif reader is not None and not name.startswith(".") and path.exists():
+                what = "is a pipe, a device or a socket, no file: passed over"
+                problems.append(Problem.warning(path, what))
             else:
                 _log.debug("%s: passed over", path)
     files.sort(key=lambda file: [natural_key(part) for part in file[0].relative_to(root).parts])

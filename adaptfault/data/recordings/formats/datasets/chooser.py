@@ -37,6 +37,7 @@ from adaptfault.data.recordings.facts.roles import (
     shape_of,
     unit_of,
 )
+from adaptfault.data.recordings.facts.sizes import MOST_CELLS
 from adaptfault.data.recordings.formats.datasets.axes import (
     DOUBTED,
     TURNED,
@@ -78,7 +79,6 @@ _ENDS = ("episode_ends", "lengths", "episode_lengths")
 _INDEX = "index"
 _SHOWN = 12  # arrays in a message
 _BESIDE = ("", "data", "meta")  # groups in which arrays of the whole file stand
-_MOST_CELLS = 1_000_000  # of a frame; more is damage, or an attack on the memory
 _MOST_AXES = 4  # of a frame: hands, pads, rows, columns
 _LONGEST_UNIT = 16
 
@@ -202,9 +202,9 @@ class Chooser:
                 what = f"{name} has {len(self.contents.arrays[name].shape)} axes; expected at most"
                 raise InputError.at(self.path, f"{what} those of [n, T, pads, rows, columns]")
         cells = sum(map(math.prod, sizes))
-        if cells > _MOST_CELLS:
+        if cells > MOST_CELLS:
             what = f"{part.names[0]} declares {cells:,} numbers a frame"
-            raise InputError.at(self.path, f"{what}; expected at most {_MOST_CELLS:,}")
+            raise InputError.at(self.path, f"{what}; expected at most {MOST_CELLS:,}")
         return sizes
 
     def _holds_recordings(self, names: Sequence[str]) -> bool:

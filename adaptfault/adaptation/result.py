@@ -32,6 +32,7 @@ from adaptfault.models.store import (
     undamaged,
 )
 from diagnostics import FaultSet
+from diagnostics.preprocessing.array_likes import plain_array
 from diagnostics.shown import shown
 
 
@@ -110,7 +111,7 @@ class Adaptation:
         return probabilities
 
     def _logits(self, x: NDArray[Any] | Tensor) -> Tensor:
-        healthy = phi(np.asarray(x, dtype=np.float32), self.fault_set)
+        healthy = phi(plain_array(x).astype(np.float32, copy=False), self.fault_set)
         return logits_of(self.model, finite_windows(healthy))
 
     @cached_property

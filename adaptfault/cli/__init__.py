@@ -58,7 +58,7 @@ BUILT_IN = {name: f"adaptfault.cli.{name.replace('-', '_')}" for name in _NAMES}
 package adds one by a module with ``add(subparsers)`` and an entry point in the same group."""
 
 
-def _parser(only: str | None = None) -> Parser:
+def parser_of(only: str | None = None) -> Parser:
     """Return the parser of all commands, or where there is one called ``only``, of that."""
     parser = Parser(
         prog="adaptfault",
@@ -90,8 +90,9 @@ def _failed(command: Command, error: Exception) -> int:
         what = "what it reads nests too deep; check the files that were given"
     elif isinstance(error, ValueError | OSError) or is_shortage(error):
         what = one_line(error)
-    if what is None:
+    if what is None or command.verbose:
         traceback.print_exception(error)
+    if what is None:
         command.complain("internal error; please report the lines above")
     else:
         command.complain(f"error: {what}")
@@ -110,7 +111,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _run(argv: Sequence[str] | None) -> int:
     given = sys.argv[1:] if argv is None else argv
-    parser = _parser(given[0] if given else None)
+    parser = parser_of(given[0] if given else None)
     args = parser.parse_args(given)
     if args.command is None:
         parser.print_help()
@@ -119,6 +120,8 @@ def _run(argv: Sequence[str] | None) -> int:
     handler = LogAboveBars()
     log.addHandler(handler)
     command: Command = args.make(args)
+    if command.verbose:
+        log.setLevel(logging.DEBUG)
     try:
         check_paths(command)
         return command.finish(command.run())
@@ -130,3 +133,4 @@ def _run(argv: Sequence[str] | None) -> int:
         return _failed(command, error)
     finally:
         log.removeHandler(handler)
+        log.setLevel(logging.NOTSET)

@@ -85,6 +85,9 @@ class Command:
     command: str
     json: bool = option("print the result as JSON")
     quiet: bool = option("no progress on stderr", short="-q")
+    verbose: bool = option(
+        "tell on stderr how each file is read, and where in the code an error arose", short="-v"
+    )
     left_out: int = field(default=0, init=False)
     untold: bool = field(default=False, init=False)
 
@@ -220,7 +223,7 @@ class Foreign(Command):
     @classmethod
     def of(cls, args: argparse.Namespace) -> Self:
         """Return the command with the options that were parsed."""
-        return cls(command=args.command, json=False, quiet=False, args=args)
+        return cls(command=args.command, json=False, quiet=False, verbose=False, args=args)
 
     def values(self) -> dict[str, Any]:
         """Return what was given."""

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from diagnostics import SensorLayout
+from diagnostics.preprocessing.array_likes import plain_array
 from diagnostics.preprocessing.copies import find_copies
 from diagnostics.preprocessing.readings import held
 from diagnostics.shown import shown
@@ -36,7 +37,7 @@ class Windows:
     recording: NDArray[np.int64]
 
     def __post_init__(self) -> None:
-        x = np.asarray(self.x, dtype=np.float32)
+        x = plain_array(self.x).astype(np.float32, copy=False)
         if x.ndim != 3:
             raise ValueError(f"windows need x of shape [N, T, D], got {list(x.shape)}")
         object.__setattr__(self, "x", x)
@@ -113,7 +114,7 @@ def hold_missing(frames: NDArray[Any]) -> NDArray[Any]:
 
 def finite_windows(x: NDArray[Any]) -> NDArray[np.float32]:
     """Return windows ``[N, T, D]`` on the 0..1 scale without missing or invalid readings."""
-    x = np.asarray(x, dtype=np.float32)
+    x = plain_array(x).astype(np.float32, copy=False)
     if x.ndim != 3 or not x.size or bool(((x >= -1) & (x <= 2)).all()):  # NaN compares as False
         return x
     missing = ~((x >= -1) & (x <= 2))  # as for a layout of full scale 1

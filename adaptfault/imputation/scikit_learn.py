@@ -23,6 +23,13 @@ from sklearn.utils.validation import check_is_fitted, validate_data
 from adaptfault.imputation.cross_fitted import CrossFitted, by_missing
 from diagnostics import FaultSet
 from diagnostics.faults import Cells
+from diagnostics.preprocessing.array_likes import plain_array
+
+
+def _unmasked(given: Any) -> Any:
+    """Return samples with what is masked as NaN, which scikit-learn would read; others as they
+    are."""
+    return plain_array(given) if isinstance(given, np.ma.MaskedArray) else given
 
 
 class CellImputer(OneToOneFeatureMixin, TransformerMixin, BaseEstimator):  # type: ignore[misc]
@@ -49,7 +56,11 @@ class CellImputer(OneToOneFeatureMixin, TransformerMixin, BaseEstimator):  # typ
         """Estimate from healthy samples ``[n, D]``, n at least 2; NaN counts as the mean of the
         feature."""
         x = validate_data(
-            self, X, dtype=np.float64, ensure_all_finite="allow-nan", ensure_min_samples=2
+            self,
+            _unmasked(X),
+            dtype=np.float64,
+            ensure_all_finite="allow-nan",
+            ensure_min_samples=2,
         )
         known = ~np.isnan(x)
         count = np.maximum(known.sum(axis=0), 1)
@@ -68,8 +79,9 @@ class CellImputer(OneToOneFeatureMixin, TransformerMixin, BaseEstimator):  # typ
         """Return ``X [n, D]`` with NaN and the cells of F imputed."""
         check_is_fitted(self)
         faulty = columns_of(self.fault_set, self.n_features_in_)
+        X = _unmasked(X)
         if faulty.any():  # whatever they hold, infinity included
-            X = np.array(X, dtype=np.float64)
+            X = np.array(plain_array(X), dtype=np.float64)
             if X.ndim == 2 and X.shape[1] == len(faulty):
                 X[:, faulty] = np.nan
         x = validate_data(
@@ -140,7 +152,7 @@ class _FaultTolerant(MetaEstimatorMixin, BaseEstimator):  # type: ignore[misc]
         """
         x, targets = validate_data(
             self,
-            X,
+            _unmasked(X),
             y,
             dtype=np.float64,
             multi_output=True,
@@ -196,7 +208,7 @@ class _FaultTolerant(MetaEstimatorMixin, BaseEstimator):  # type: ignore[misc]
 
     def _input(self, X: ArrayLike) -> NDArray[np.float64]:
         check_is_fitted(self)
-        x = np.array(X, dtype=np.float64)
+        x = np.array(plain_array(X), dtype=np.float64)
         if x.ndim == 2 and x.shape[1] == self.n_features_in_:
             x[:, self._mask] = np.nan
         x = self._imputer.transform(x)

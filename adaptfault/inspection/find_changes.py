@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from adaptfault.inspection.changed_readings import ChangedReadings, Frames
 from diagnostics import Diagnosis, FaultKind, FaultSet, SelfDiagnosis
-from diagnostics.preprocessing.levels import EXPECTED, LEAST_LOADED
+from diagnostics.preprocessing.levels import EXPECTED, LEAST_LOADED, MAJORITY
 from diagnostics.sensor.another_sensor import AnotherSensor, find_another_sensor
 from diagnostics.sensor.recalibration import Recalibration, find_recalibration
 from diagnostics.sensor.rewiring import Rewiring
@@ -52,10 +52,18 @@ def find_changed_readings(
             one sensor from another.
     """
     exchanged = _put_back(diagnoser, frames)
+    if exchanged is not None and exchanged.rewiring is not None and comparable:
+        still = _another(diagnoser, exchanged, healthy)
+        if still is not None and still.is_whole:  # the wires do not explain it
+            exchanged = None
     as_found = ChangedReadings(None, None, frames, diagnoser.diagnose(frames))
     another = None
     if exchanged is None and comparable:
         another = _another(diagnoser, as_found, healthy)
+        if another is None:
+            own = _as_own_reference(diagnoser, as_found, healthy)
+            if own is not None:
+                return own
     if another is not None and not another.is_whole:
         left = another.left_out(frames)
         return ChangedReadings(None, None, left, _left(diagnoser.diagnose(left)), another=another)
@@ -75,23 +83,83 @@ def _as_another(as_found: ChangedReadings, another: AnotherSensor) -> ChangedRea
     return replace(as_found, diagnosis=diagnosis, another=another)
 
 
-def _another(
+def _as_own_reference(
     diagnoser: SelfDiagnosis, as_found: ChangedReadings, healthy: Sequence[NDArray[Any]]
+) -> ChangedReadings | None:
+    """Return a log of another sensor of which the reference calls so many cells faulty that the
+    others do not tell it: it is its own reference. None where most of these are faulty then, too,
+    or the log is of the same sensor."""
+    layout = diagnoser.layout
+    explained = _explained(as_found.diagnosis)[layout.present.ravel()]
+    if not as_found.diagnosis.fault_set or explained.mean() <= MAJORITY / 2:
+        return None
+    another = _another(diagnoser, as_found, healthy, with_faulty=True)
+    if another is None or not another.is_whole:
+        return None
+    own = SelfDiagnosis(layout).diagnose(as_found.frames)
+    diagnosis = _on_pads(as_found.diagnosis, own, another.pads)
+    if diagnosis.n_lost > as_found.diagnosis.n_lost / 2:
+        return None
+    return replace(as_found, diagnosis=diagnosis, another=another)
+
+
+def _on_pads(diagnosis: Diagnosis, own: Diagnosis, pads: Sequence[int]) -> Diagnosis:
+    """Return a diagnosis with what another one tells of some pads."""
+    on = np.isin(diagnosis.layout.pad_of, pads)
+    if on.all():
+        return replace(own, names=diagnosis.names)
+
+    def both(ours: Sequence[Any], theirs: Sequence[Any]) -> tuple[Any, ...]:
+        kept = [one for one in ours if not on[[*one.cells]].any()]
+        return (*kept, *(one for one in theirs if on[[*one.cells]].all()))
+
+    return replace(
+        diagnosis,
+        faults=both(diagnosis.faults, own.faults),
+        possible=both(diagnosis.possible, own.possible),
+        static_loads=both(diagnosis.static_loads, own.static_loads),
+        tested=np.where(on, own.tested, diagnosis.tested),
+        probability=np.where(on, own.probability, diagnosis.probability),
+        states=None,
+    )
+
+
+def _explained(diagnosis: Diagnosis) -> NDArray[np.bool_]:
+    """Return the cells, bool ``[D]``, that faults or objects explain: another sensor is told by
+    those that are left."""
+    return _faulty(diagnosis) | diagnosis.disturbed.mask
+
+
+def _another(
+    diagnoser: SelfDiagnosis,
+    as_found: ChangedReadings,
+    healthy: Sequence[NDArray[Any]],
+    *,
+    with_faulty: bool = False,
 ) -> AnotherSensor | None:
     """Return which recordings come from another sensor than the reference; None: none, or nothing
-    tells."""
+    tells.
+
+    Args:
+        diagnoser, as_found, healthy: of the log and the reference.
+        with_faulty: also by cells that are faulty as the reference has it, which may be healthy
+            ones of another sensor.
+    """
     load = diagnoser.load_
     unknown = diagnoser.layout.axes > 1 or (load is not None and load.direction == "middle")
     if diagnoser.reference_ is None or unknown:
         return None
     diagnosis = as_found.diagnosis
     frames = diagnoser.without_gain(as_found.frames) or as_found.frames
+    excluded = _explained(diagnosis)
+    if with_faulty:
+        excluded = np.ptp(np.concatenate(frames), axis=0) == 0
     return find_another_sensor(
         as_loads(diagnoser, list(frames)),
         as_loads(diagnoser, healthy),
         diagnoser.reference_,
         diagnoser.layout,
-        _faulty(diagnosis) | diagnosis.disturbed.mask,
+        excluded,
     )
 
 

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from diagnostics import SensorLayout
+from diagnostics.preprocessing.array_likes import plain_array
 
 FILTERS = (16, 32)  # of the two 3 x 3 convolutions
 BLOCKS = 2
@@ -276,7 +277,7 @@ def logits_of(model: nn.Module, x: Batch, *, batch_size: int = 256) -> Tensor:
 
     The result is on the CPU. Each module of ``model`` returns to its earlier mode.
     """
-    windows = x if isinstance(x, Tensor) else as_tensor(np.asarray(x, dtype=np.float32))
+    windows = x if isinstance(x, Tensor) else as_tensor(plain_array(x).astype(np.float32))
     device = next((p.device for p in model.parameters()), windows.device)
     batches = torch.split(windows, batch_size) if len(windows) else (windows,)
     with evaluating(model):

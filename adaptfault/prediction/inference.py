@@ -21,6 +21,7 @@ from adaptfault.models.store import (
     undamaged,
 )
 from diagnostics import FaultSet, SensorLayout
+from diagnostics.preprocessing.array_likes import plain_array
 
 if TYPE_CHECKING:
     from onnxruntime import InferenceSession
@@ -143,7 +144,7 @@ class Inference:
         return self._outputs(x)
 
     def _outputs(self, x: NDArray[Any]) -> NDArray[np.float32]:
-        x = np.asarray(x, dtype=np.float32)
+        x = plain_array(x).astype(np.float32, copy=False)
         if x.ndim != 3 or x.shape[1:] != (self.length, self.layout.n_cells):
             raise ValueError(
                 f"expected windows [N, {self.length}, {self.layout.n_cells}], got {list(x.shape)}"

@@ -33,6 +33,7 @@ _KEPT = 50_000_000  # readings whose distance from rest is kept in memory: a siz
 _FEWEST = 64  # loaded readings, in so many frames at least:
 _FRAMES = 4
 _OVERLAP = 0.5  # of the shorter recording
+_ODD = 50  # one frame of so many, and always one, tells nothing: it may be corrupt
 
 Floats = NDArray[np.floating[Any]]
 
@@ -203,10 +204,18 @@ def _same(
     loaded = np.maximum(np.abs(a), np.abs(b))[:, moving] > _LOADED * tolerance
     if loaded.sum() < _FEWEST or loaded.any(axis=1).sum() < _FRAMES:
         return False
-    usual = float(np.var(a[:, moving], axis=0).sum())
-    difference = float(np.square(a - b)[:, moving].mean(axis=0).sum())
+    # one frame of full scale, which is corrupt, would be all that moves
+    usual = _without_odd(np.square(a - np.median(a, axis=0))[:, moving])
+    difference = _without_odd(np.square(a - b)[:, moving])
     most = _DIFFERS_SHORT if end - begin < _SHORT else _DIFFERS
     return difference <= most**2 * usual
+
+
+def _without_odd(squares: NDArray[np.float32]) -> float:
+    """Return the sum over the cells of the mean over the frames, ``[T, D]``, without the largest
+    frames."""
+    frames = np.sort(squares.sum(axis=1))
+    return float(frames[: -max(1, len(frames) // _ODD)].mean())
 
 
 def _agree(a: NDArray[np.float32], b: NDArray[np.float32], tolerance: float) -> bool:

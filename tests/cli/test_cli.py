@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from conftest import worn
 
-from adaptfault.cli import BUILT_IN, _parser, main
+from adaptfault.cli import BUILT_IN, main, parser_of
 from adaptfault.cli.streams import LogAboveBars
 from adaptfault.data.recordings import Opened, Recordings, save_npz
 from adaptfault.data.simulated_grasps import simulate
@@ -502,7 +502,7 @@ def numeric_options(
 
 @pytest.mark.parametrize("number", ["nan", "inf", "-inf", "1e400", "-1", "-0.5"])
 def test_every_numeric_option_refuses_what_is_negative_or_not_finite(number, capsys):
-    parser = _parser()  # once: main makes it for each call
+    parser = parser_of()  # once: main makes it for each call
     options = list(numeric_options(parser))
     assert ("maintain", "--budget") in options
     assert ("fleet", "maintain", "--budget") in options
@@ -695,3 +695,18 @@ def test_training_shows_batches_with_an_end_and_warnings_stand_on_lines_of_their
         logging.LogRecord("adaptfault", logging.WARNING, "", 0, "the disk is full", None, None)
     )
     assert capsys.readouterr().err == "the disk is full\n"
+
+
+def test_verbose_tells_how_files_are_read_and_where_an_error_arose(home, tmp_path, capsys):
+    shutil.copy(home / "grasps.npz", tmp_path)
+    (tmp_path / "notes.doc").write_text("pressed by hand")
+    assert main(["info", str(tmp_path), "-v"]) == 0
+    said = capsys.readouterr().err
+    assert "grasps.npz: read by adaptfault.data.recordings.formats.npz" in said
+    assert "notes.doc: passed over" in said
+    assert main(["info", str(tmp_path)]) == 0
+    assert "passed over" not in capsys.readouterr().err
+    assert main(["diagnose", str(tmp_path), "--reference", str(tmp_path / "notes.doc"), "-v"]) == 3
+    said = capsys.readouterr().err
+    assert "Traceback" in said
+    assert said.splitlines()[-1].startswith("adaptfault diagnose: error: ")

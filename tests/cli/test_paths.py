@@ -16,7 +16,7 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from adaptfault.cli import _parser, main
+from adaptfault.cli import main, parser_of
 from adaptfault.cli.paths import Read, Written
 from adaptfault.data.recordings.errors import InputError
 from adaptfault.data.recordings.valid import write_valid
@@ -56,7 +56,7 @@ def commands(parser: argparse.ArgumentParser) -> dict[str, argparse.ArgumentPars
     return found
 
 
-COMMANDS = commands(_parser())
+COMMANDS = commands(parser_of())
 
 
 def of_kind(parser: argparse.ArgumentParser, kind: type) -> list[argparse.Action]:

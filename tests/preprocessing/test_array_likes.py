@@ -2,6 +2,8 @@
 
 import numpy as np
 import pytest
+from conftest import SMALL
+from sklearn.linear_model import LinearRegression
 
 import adaptfault as af
 from diagnostics import Monitor, SelfDiagnosis, SensorLayout, inject
@@ -90,3 +92,40 @@ def test_imaginary_parts_are_refused():
         SelfDiagnosis(LAYOUT).fit(np.ma.array(FRAMES + 1j))
     with pytest.raises(ValueError, match="complex numbers"):
         LAYOUT.check_frame(FRAMES[0] + 1j)
+
+
+def test_masks_and_imaginary_parts_of_windows_and_samples_are_neither_lost_nor_ignored(versions):
+    rng = np.random.default_rng(0)
+    x = rng.random((40, 18))
+    mask = rng.random(x.shape) < 0.1
+    masked = np.ma.array(x, mask=mask)
+    missing = np.where(mask, np.nan, x)
+    statistics = af.CellImputer([3]).fit(masked)
+    expected = af.CellImputer([3]).fit(missing)
+    np.testing.assert_array_equal(statistics.mean_, expected.mean_)
+    for given in (masked, missing):
+        np.testing.assert_array_equal(statistics.transform(given), expected.transform(missing))
+    y = x[:, :2].sum(axis=1)
+    one = af.FaultTolerantRegressor(LinearRegression()).fit(masked, y).set_faults([3])
+    two = af.FaultTolerantRegressor(LinearRegression()).fit(missing, y).set_faults([3])
+    np.testing.assert_array_equal(one.predict(masked), two.predict(missing))
+    np.testing.assert_array_equal(af.correct(masked), af.correct(missing))
+    windows = masked.reshape(8, 5, 18)
+    labels = np.zeros(8, int)
+    held = af.Windows(windows, labels, labels)
+    np.testing.assert_array_equal(held.x, missing.reshape(8, 5, 18).astype(np.float32))
+    adaptation = af.Adaptation.load(versions["head"])
+    outputs = [adaptation.predict_proba(given) for given in (windows, missing.reshape(8, 5, 18))]
+    np.testing.assert_array_equal(*outputs)
+    network = af.TactileTransformer(SMALL, 2, length=5)
+    refusing = (
+        af.correct,
+        af.CellImputer().fit,
+        statistics.transform,
+        lambda values: af.Windows(values.reshape(8, 5, 18), labels, labels),
+        lambda values: adaptation.predict(values.reshape(8, 5, 18)),
+        lambda values: network.predict(values.reshape(8, 5, 18)),
+    )
+    for function in refusing:
+        with pytest.raises(ValueError, match=r"[Cc]omplex"):
+            function(x + 1j)

@@ -46,3 +46,18 @@ def test_what_no_converter_sends_is_no_copy_and_no_warning(grasps):
     given[2][5] = np.inf
     given[3][:] = np.nan
     assert find_copies([*given, given[0][2:]]).tolist() == [0, 1, 2, 3, 0]
+
+
+@pytest.mark.parametrize("corrupt", [1, 3])
+def test_recordings_that_share_corrupt_frames_alone_are_no_copies(corrupt):
+    rng = np.random.default_rng(corrupt)
+    y, x = np.mgrid[:16, :8]
+    given = []
+    for _ in range(4):  # somebody lies, a little elsewhere in each, and breathes
+        body = 300 * np.exp(-((y - 8) ** 2) / 10 - (x - 3.5 - rng.normal(0, 0.5)) ** 2 / 6)
+        breath = 1 + 0.3 * np.sin(np.arange(160) / 7 + rng.uniform(0, 6))
+        frames = np.round(body.ravel() * breath[:, None] + rng.gamma(0.4, 1.2, (160, 128)))
+        frames[rng.permutation(160)[:corrupt]] = 4095
+        given.append(frames)
+    assert find_copies(given).tolist() == [0, 1, 2, 3]
+    assert find_copies([*given, given[2][10:]]).tolist() == [0, 1, 2, 3, 2]

@@ -3,6 +3,7 @@ reason is told."""
 
 import json
 import os
+import shutil
 import zipfile
 
 import numpy as np
@@ -316,6 +317,18 @@ def test_a_file_of_any_other_width_is_left_out_beside_any_shape_in_any_format(
     (told,) = messages(loaded, "error")
     assert f"_odd{other}" in told
     assert f"{width} value{'s' * (width != 1)} a frame" in told
+
+
+@pytest.mark.parametrize("suffix", FORMATS)
+def test_a_file_that_was_written_anew_is_read_anew(suffix, tmp_path):
+    path = tmp_path / f"a{suffix}"
+    for again in range(3):
+        written = np.random.default_rng(again).integers(100, 900, (40, 12)).astype(np.float32)
+        if suffix == ".zarr" and path.exists():
+            shutil.rmtree(path)
+        write_frames(path, written)
+        loaded = load(path, layout=GRID)
+        np.testing.assert_array_equal(loaded.recordings.frames[0], written)
 
 
 def test_lists_of_different_lengths_are_refused_with_their_row(tmp_path):

@@ -1,6 +1,7 @@
 """Text files as people and instruments write them: separators, preambles, encodings, matrices."""
 
 import json
+import os
 import re
 from pathlib import Path
 
@@ -406,14 +407,23 @@ def test_cells_stand_in_the_order_of_their_numbers_as_in_parquet(
     loaded = load(tmp_path, layout="3x4")
     np.testing.assert_array_equal(loaded.recordings.frames[0], expected)
     told = [text for text in loaded.inferred if "in the order of their numbers" in text]
-    assert is_table or len(told) == 1
+    assert len(told) == 1
 
 
-@pytest.mark.parametrize("names", ["ch7,ch3,ch1,ch9", "x0y0,x1y0,x0y1,x1y1", "a,b,c,d"])
-def test_columns_whose_numbers_say_nothing_of_their_place_stay_as_they_stand(tmp_path, names):
+@pytest.mark.parametrize("is_table", [True, False])
+@pytest.mark.parametrize(
+    "names", ["ch7,ch3,ch1,ch9", "x0y0,x1y0,x0y1,x1y1", "c3,c2,c1,c0", "R1,R0,L0,L1", "a,b,c,d"]
+)
+def test_columns_whose_numbers_say_nothing_of_their_place_stay_as_they_stand(
+    tmp_path, names, is_table
+):
     columns = names.split(",")
     values = {name: np.arange(20) % 7 + 10 * i for i, name in enumerate(columns)}
-    _named_columns(tmp_path / "a.csv", columns, values)
+    if is_table:
+        pq = pytest.importorskip("pyarrow.parquet")
+        pq.write_table(pytest.importorskip("pyarrow").table(values), tmp_path / "a.parquet")
+    else:
+        _named_columns(tmp_path / "a.csv", columns, values)
     expected = np.stack([values[name] for name in columns], axis=1)
     np.testing.assert_array_equal(load(tmp_path, layout="2x2").recordings.frames[0], expected)
 
@@ -668,3 +678,37 @@ def test_a_class_that_changes_all_the_time_is_told_with_what_is_lost(tmp_path):
     (told,) = messages(loaded, "warning")
     assert "the class changes 39 times within a recording" in told
     assert "that of 20 of 60 frames is lost" in told
+
+
+@pytest.mark.parametrize(
+    ("content", "told"),
+    [
+        ("1," * 1_500_000, "line 1: holds over 1,000,000 numbers"),
+        ("c0,c1\n" + "1 " * 1_500_000 + "\n", "line 2: holds over 1,000,000 numbers"),
+        ("1" * 3000, "line 1: is over 2,000 bytes long"),
+    ],
+)
+def test_a_line_that_is_longer_than_any_frame_is_named_and_the_others_are_read(
+    tmp_path, monkeypatch, content, told
+):
+    if len(content) < 10_000:
+        monkeypatch.setattr("adaptfault.data.recordings.formats.dialect.LONGEST_LINE", 2000)
+        monkeypatch.setattr("adaptfault.data.recordings.formats.dialect._CHUNK", 500)
+    (tmp_path / "a.csv").write_text(content)
+    np.save(tmp_path / "good.npy", VALUES.astype(np.float32))
+    loaded = load(tmp_path, layout="1x6")
+    assert len(loaded.recordings) == 1
+    (error,) = [problem for problem in loaded.problems if problem.level == "error"]
+    assert told in error.message
+
+
+def test_what_is_no_file_is_named_and_passed_over(tmp_path):
+    np.save(tmp_path / "good.npy", VALUES.astype(np.float32))
+    os.mkfifo(tmp_path / "pipe.csv")
+    (tmp_path / "zero.npz").symlink_to("/dev/zero")
+    loaded = load(tmp_path, layout="1x6")
+    assert len(loaded.recordings) == 1
+    told = [problem.message for problem in loaded.problems]
+    assert all("is a pipe, a device or a socket" in message for message in told)
+    names = sorted(message.partition(":")[0].rpartition("/")[2] for message in told)
+    assert names == ["pipe.csv", "zero.npz"]

@@ -109,3 +109,71 @@ def test_dead_and_weak_cells_an_object_and_a_gain_are_no_other_sensor(fitted, re
     for log in logs:
         found = af.inspect(log, fitted, reference=reference)
         assert "another_sensor" not in {finding.name for finding in found.findings}
+
+
+PAD = SensorLayout(1, 9, 7, full_scale=4095.0, unit="count", rate=20.0)
+OWN = 12345  # the sensor of the reference
+
+
+def slides(seed: int, n: int, sensor: int) -> list[np.ndarray]:
+    """Return recordings in which one to three contacts slide over the pad of a sensor."""
+    own = np.random.default_rng(sensor)
+    rest = own.uniform(20, 60, 63)
+    gain = own.uniform(0.6, 1.4, 63)
+    rng = np.random.default_rng(seed)
+    row, column = np.divmod(np.arange(63), 7)
+    time = np.arange(60)[:, None]
+    found = []
+    for _ in range(n):
+        load = np.zeros((60, 63))
+        for _ in range(rng.integers(1, 4)):
+            begin = int(rng.integers(2, 30))
+            end = int(rng.integers(begin + 8, 58))
+            swell = np.clip((time - begin) / 4, 0, 1) * np.clip((end - time) / 4, 0, 1)
+            y = rng.uniform(0, 8) + rng.normal(0, 0.05) * (time - begin)
+            x = rng.uniform(0, 6) + rng.normal(0, 0.05) * (time - begin)
+            apart = (row - y) ** 2 + (column - x) ** 2
+            peak = rng.uniform(600, 2900) * np.exp(-apart / 2 / rng.uniform(0.8, 1.8) ** 2)
+            load += swell * peak
+        frames = rest + gain * load + rng.normal(0, 2, load.shape)
+        found.append(np.clip(np.rint(frames), 0, 4095))
+    return found
+
+
+@pytest.fixture(scope="module")
+def slid() -> list[np.ndarray]:
+    return slides(1, 50, sensor=OWN)
+
+
+@pytest.fixture(scope="module")
+def fitted_to_slides(slid) -> SelfDiagnosis:
+    return SelfDiagnosis(PAD).fit(slid)
+
+
+@pytest.mark.parametrize("sensor", [3, 6, 7])
+def test_a_pad_of_the_same_kind_is_neither_faulty_nor_wired_otherwise(
+    fitted_to_slides, slid, sensor
+):
+    found = af.inspect(slides(3, 24, sensor), fitted_to_slides, reference=slid)
+    assert {"replaced_pad", "another_sensor"} & {finding.name for finding in found.findings}
+    assert not {"rewired", "transposed", "fault", "wire"} & {f.name for f in found.findings}
+    assert not found.diagnosis.fault_set
+
+
+def test_exchanged_wires_and_dead_cells_of_the_own_pad_are_no_other_pad(fitted_to_slides, slid):
+    own = slides(3, 24, sensor=OWN)
+    rows = np.arange(63).reshape(9, 7)[[0, 5, 2, 3, 4, 1, 6, 7, 8]].ravel()
+    found = af.inspect([one[:, rows] for one in own], fitted_to_slides, reference=slid)
+    assert "rewired" in {finding.name for finding in found.findings}
+    dead = np.random.default_rng(0).permutation(63)[:24]
+    held = [np.where(np.isin(np.arange(63), dead), 40, one) for one in own]
+    found = af.inspect(held, fitted_to_slides, reference=slid)
+    assert "another_sensor" not in {finding.name for finding in found.findings}
+    assert len(set(found.diagnosis.fault_set) & set(dead.tolist())) >= 20
+    rest = np.random.default_rng(OWN).uniform(20, 60, 63)
+    worn = {16, 17, 24, 46}
+    gain = np.where(np.isin(np.arange(63), [*worn]), 0.1, 1.0)
+    weak = [np.rint(rest + gain * (one - rest)) for one in own]
+    found = af.inspect(weak, fitted_to_slides, reference=slid)
+    assert "another_sensor" not in {finding.name for finding in found.findings}
+    assert set(found.diagnosis.fault_set) == worn

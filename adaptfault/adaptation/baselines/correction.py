@@ -27,6 +27,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from adaptfault.imputation.statistics import CellStatistics
+from diagnostics.preprocessing.array_likes import plain_array
 
 STEP = 1 / 4095  # of a 12-bit converter, as the paper's ESP32 has, on the 0..1 scale
 TOLERANCE = 1.5 * STEP  # a cell at the rail may vary by one converter step
@@ -165,7 +166,7 @@ def _runs(hit: NDArray[np.bool_], before: NDArray[np.int64]) -> NDArray[np.int64
 
 
 def _readings(x: ArrayLike) -> NDArray[Any]:
-    x = np.asarray(x)
+    x = plain_array(x)
     return x if x.dtype in (np.float32, np.float64) else x.astype(np.float64)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -10,6 +11,8 @@ from pathlib import Path
 from adaptfault.data.recordings.errors import InputError, Problem, located
 from adaptfault.data.recordings.facts.labels import TABLE, TARGETS, natural_key
 from adaptfault.data.recordings.readers import Reader, reader_of, suffixes
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -76,6 +79,8 @@ def find(
         else:
             what = f"is no recording; expected a folder or a file that ends in {endings}"
             problems.append(Problem("error", located(path, what)))
+    for one in found.values():
+        _log.debug("%s: read by %s", one.path, getattr(one.reader, "__name__", one.reader))
     return list(found.values()), problems
 
 
@@ -108,6 +113,11 @@ def _below(root: Path, known: Mapping[str, Reader], problems: list[Problem]) -> 
             reader = reader_of(path, known, is_folder=False)
             if reader is not None and not name.startswith(".") and path.is_file():
                 files.append((path, reader))
+            elif reader is not None and not name.startswith(".") and path.exists():
+                what = "is a pipe, a device or a socket, no file: passed over"
+                problems.append(Problem.warning(path, what))
+            else:
+                _log.debug("%s: passed over", path)
     files.sort(key=lambda file: [natural_key(part) for part in file[0].relative_to(root).parts])
     labels = table if table.is_file() else None
     for path, reader in files:

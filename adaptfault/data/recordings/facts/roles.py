@@ -174,13 +174,6 @@ def readings(names: Sequence[str], cells: int | None = None) -> list[int]:
     return sorted(touch) if touch and len(kept) != cells else kept
 
 
-def by_family(names: Sequence[str], columns: Sequence[str]) -> list[str]:
-    """Return names in the order in which their families begin among the ``columns`` of a file; the
-    order within a family stays."""
-    stems = [_DIGITS.sub("*", column) for column in columns]
-    return sorted(names, key=lambda name: stems.index(_DIGITS.sub("*", name)))
-
-
 def in_order(names: Sequence[str], shape: Shape | None = None) -> list[int]:
     """Return the columns with some names in the order of their numbers, where the file has another
     one for no reason of the sensor: names that were sorted as text (``c0, c1, c10, c2``), or whose
@@ -200,6 +193,16 @@ def in_order(names: Sequence[str], shape: Shape | None = None) -> list[int]:
             for place, column in zip(columns, counted, strict=True):
                 order[place] = column
     return order
+
+
+def reordered(stand: Sequence[str], ordered: Sequence[str], option: str) -> str:
+    """Return the sentence that columns are read in another order than they stand in; "" where they
+    are not."""
+    for there, read in zip(stand, ordered, strict=True):
+        if there != read:
+            what = f"{read} is read where {there} stands"
+            return f"columns in the order of their numbers: {what}; otherwise give --{option}"
+    return ""
 
 
 def left_out(others: Sequence[str], kept: Sequence[str], option: str) -> str:

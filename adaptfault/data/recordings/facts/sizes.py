@@ -19,6 +19,9 @@ MOST_BYTES = 2 << 30
 LONGEST_LINE = 64 << 20
 """Bytes of a line of text: a million cells of 64 digits."""
 
+MOST_CELLS = 1_000_000
+"""Numbers of a frame; more is damage, or an attack on the memory."""
+
 _MOST_TEXT = 4096  # bytes of one text in an array of texts
 
 

@@ -25,6 +25,7 @@ from adaptfault.data.recordings.facts.roles import (
     is_clock,
     left_out,
     no_readings,
+    reordered,
     shape_of,
     unit_of,
 )
@@ -198,10 +199,7 @@ def _numbered(
     others = [names[i] or str(i) for i in columns if i not in kept]
     told = [left_out(others, [names[i] for i in kept], "columns")]
     ordered = [kept[i] for i in in_order([names[i] for i in kept], shape)]
-    if ordered != kept:
-        first = next(i for i, column in enumerate(ordered) if column != kept[i])
-        what = f"{names[ordered[first]]} is read where {names[kept[first]]} stands"
-        told.append(f"columns in the order of their numbers: {what}; otherwise give --columns")
+    told.append(reordered([names[i] for i in kept], [names[i] for i in ordered], "columns"))
     return ordered, tuple(filter(None, told))
 
 

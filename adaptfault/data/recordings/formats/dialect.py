@@ -19,7 +19,8 @@ from pathlib import Path
 
 import numpy as np
 
-from adaptfault.data.recordings.facts.sizes import LONGEST_LINE
+from adaptfault.data.recordings.errors import InputError
+from adaptfault.data.recordings.facts.sizes import LONGEST_LINE, MOST_CELLS
 from adaptfault.data.recordings.formats.text import LATIN
 
 COMMENTS = ("#", "%", "//")
@@ -202,7 +203,11 @@ def encoding_of(path: Path) -> str:
 
 def numbered(path: Path) -> Iterator[tuple[int, str]]:
     """Yield the number and the text of each line of a file, "" for a blank line, up to a zero byte:
-    behind it nothing is data, nor is the line that holds it."""
+    behind it nothing is data, nor is the line that holds it.
+
+    Raises:
+        InputError: a line is longer than any frame, or holds more numbers.
+    """
     at = 0
     parts: list[str] = []  # of the line that the last chunk cut
     with builtins.open(path, encoding=encoding_of(path), errors=LATIN) as file:
@@ -212,15 +217,25 @@ def numbered(path: Path) -> Iterator[tuple[int, str]]:
                 at += 1
                 whole = "".join([*parts, line])
                 parts = []
+                _check_width(path, at, whole)
                 yield at, unquoted(whole) if whole.strip() else ""
             if "\0" in chunk:
                 return
             parts.append(rest)
             if sum(map(len, parts)) > LONGEST_LINE:
-                break
+                what = f"is over {LONGEST_LINE:,} bytes long, so it is no frame"
+                raise InputError.at(path, f"{what}; remove it", f"line {at + 1}")
     whole = "".join(parts)
     if whole:
+        _check_width(path, at + 1, whole)
         yield at + 1, unquoted(whole) if whole.strip() else ""
+
+
+def _check_width(path: Path, at: int, line: str) -> None:
+    """Raise InputError where a line holds more numbers than any frame."""
+    if len(line) > MOST_CELLS and max(map(line.count, ",;\t |")) > MOST_CELLS:
+        what = f"holds over {MOST_CELLS:,} numbers, so it is no frame"
+        raise InputError.at(path, f"{what}; remove it", f"line {at}")
 
 
 def find_dialect(path: Path) -> Dialect | None:

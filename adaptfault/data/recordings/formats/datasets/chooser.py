@@ -30,12 +30,14 @@ from adaptfault.data.recordings.facts.roles import (
     COUNTERS,
     EPISODES,
     LABELS,
-    by_family,
+    in_order,
     is_clock,
     left_out,
+    reordered,
     shape_of,
     unit_of,
 )
+from adaptfault.data.recordings.facts.sizes import MOST_CELLS
 from adaptfault.data.recordings.formats.datasets.axes import (
     DOUBTED,
     TURNED,
@@ -77,7 +79,6 @@ _ENDS = ("episode_ends", "lengths", "episode_lengths")
 _INDEX = "index"
 _SHOWN = 12  # arrays in a message
 _BESIDE = ("", "data", "meta")  # groups in which arrays of the whole file stand
-_MOST_CELLS = 1_000_000  # of a frame; more is damage, or an attack on the memory
 _MOST_AXES = 4  # of a frame: hands, pads, rows, columns
 _LONGEST_UNIT = 16
 
@@ -110,7 +111,7 @@ class Chooser:
                 self._beside.setdefault(name.rpartition("/")[0], []).append(name)
         self._texts: dict[str, list[str]] = {}
         self.divisions: list[Division] = []
-        self.left_out = ""
+        self.by_names: list[str] = []
         self.lost: list[str] = []
 
     def episodes(self, key: str | None) -> list[tuple[str, list[str]]]:
@@ -131,8 +132,10 @@ class Chooser:
         if key is None and chosen and not any(features.get(name) for name in chosen):
             others = [name for name in features if name not in chosen and not features[name]]
             in_file = by_episode(list(listed)).values()
-            chosen = by_family(chosen, [name for names in in_file for name in names])
-            self.left_out = left_out(others, chosen, "key")
+            every = dict.fromkeys(name for names in in_file for name in names)
+            stand = [name for name in every if name in chosen]
+            chosen = [stand[i] for i in in_order(stand, self.shape)]
+            self.by_names = [left_out(others, chosen, "key"), reordered(stand, chosen, "key")]
         found = [
             (episode, [names[common] for common in chosen])
             for episode, names in grouped.items()
@@ -199,9 +202,9 @@ class Chooser:
                 what = f"{name} has {len(self.contents.arrays[name].shape)} axes; expected at most"
                 raise InputError.at(self.path, f"{what} those of [n, T, pads, rows, columns]")
         cells = sum(map(math.prod, sizes))
-        if cells > _MOST_CELLS:
+        if cells > MOST_CELLS:
             what = f"{part.names[0]} declares {cells:,} numbers a frame"
-            raise InputError.at(self.path, f"{what}; expected at most {_MOST_CELLS:,}")
+            raise InputError.at(self.path, f"{what}; expected at most {MOST_CELLS:,}")
         return sizes
 
     def _holds_recordings(self, names: Sequence[str]) -> bool:
@@ -278,7 +281,7 @@ class Chooser:
         whole = all(contents.arrays[one].dtype.kind in "iu" for one in part.names)
         are_cells = len(part.names) > 1 and not any(map(self._sizes, part.names))
         by_name = shape_of(part.names) if are_cells and self.shape is None else None
-        told = [self.left_out, *(division.inferred for division in self.divisions)]
+        told = [*self.by_names, *(division.inferred for division in self.divisions)]
         return Facts(
             self.path,
             counts=whole and not any(one.is_scaled for one in packings),
@@ -320,13 +323,14 @@ class Chooser:
         """Yield the recordings in the arrays of each episode."""
         for place, (group, names) in enumerate(episodes):
             length = self._common_length(names)
+            written = self._written(names, length)
             clock = self._clock(names[0], length)
             classes = self._classes(names[0])
             start = partial(Part, tuple(names), clock=clock, group=group)
             if self.outer:
                 for i, frames in enumerate(self._lengths(names[0])):
                     label = classes.of_recording(i, length)
-                    yield start(0, frames, outer=i, clock=None, label=label)
+                    yield start(0, frames if i < written else 0, outer=i, clock=None, label=label)
                 continue
             column = self._episode_column(names[0], length)
             if self.ends is not None:
@@ -336,9 +340,9 @@ class Chooser:
                     what = f"{names[0]}: {behind} frames behind the last end in {self.ends}"
                     self.lost.append(f"{what} are left out")
             elif column is not None and not group:
-                found = self._runs(column)
+                found = self._runs(column, written)
             else:
-                found = [Episode(0, length)]
+                found = [Episode(0, written)]
             is_group = len(found) == 1 and found[0].number is None
             first = place if is_group else 0
             count = len(episodes) if is_group else len(found)
@@ -348,7 +352,9 @@ class Chooser:
                 number = episode.number
                 if episode.part is not None and number is not None:
                     number = f"{number}, part {episode.part}"
-                yield start(episode.first, episode.last, label=episode.label, number=number)
+                first = min(episode.first, written)
+                last = min(episode.last, written)
+                yield start(first, last, label=episode.label, number=number)
 
     def _common_length(self, names: Sequence[str]) -> int:
         """Return how many frames all of some arrays hold."""
@@ -360,6 +366,19 @@ class Chooser:
             what = f"{longest} holds {lengths[longest]} frames where {shortest} has"
             self.lost.append(f"{what} {lengths[shortest]}: the last {more} are left out")
         return lengths[shortest]
+
+    def _written(self, names: Sequence[str], length: int) -> int:
+        """Return how many of the frames that all of some arrays hold there are up to the last that
+        was written; of recordings where the first axis counts these."""
+        ends = [self.contents.written[name] for name in names if name in self.contents.written]
+        if not ends:
+            return length
+        written = min(length, *(end[-1] if self.is_turned else end[0] for end in ends))
+        if written < length:
+            what = "recordings" if self.outer else "frames"
+            never = f"the last {length - written} {what} were never written"
+            self.lost.append(f"{names[0]}: {never}, and are left out")
+        return written
 
     def _episode_column(self, name: str, length: int) -> str | None:
         """Return the array that numbers the episode of each row of a table; None without one.
@@ -411,10 +430,10 @@ class Chooser:
         bounds = enumerate(pairwise([0, *ends.tolist()]))
         return [Episode(first, last, number) for number, (first, last) in bounds]
 
-    def _runs(self, name: str) -> list[Episode]:
-        """Return the episodes that a column numbers."""
+    def _runs(self, name: str, length: int) -> list[Episode]:
+        """Return the episodes that a column numbers up to some frame."""
         array = self.contents.arrays[name]
-        stored = np.asarray(array[:]).ravel()
+        stored = np.asarray(array[:]).ravel()[:length]
         if array.dtype.kind in TEXTS:
             stored = np.array(texts(stored))
         if stored.dtype.kind == "f" and not np.isfinite(stored).all():

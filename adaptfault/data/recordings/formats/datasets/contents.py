@@ -59,7 +59,9 @@ class Contents:
 
     Attributes:
         arrays: of numbers, times and texts, by their names with groups, as "data/tactile".
-        valid: which readings of an array are valid, by its name: what ``check --write-copy`` wrote.
+        valid: which readings of an array are valid, by its name: what ``check --write-copy`` wrote,
+            or those that were written at all.
+        written: sizes of the part of an array that was written, where that is not all of it.
         attributes: of each group and array that has some; "" is the file itself.
         left_out: arrays that cannot be read, and why.
         told: other warnings.
@@ -68,6 +70,7 @@ class Contents:
 
     arrays: dict[str, Array] = field(default_factory=dict)
     valid: dict[str, Array] = field(default_factory=dict)
+    written: dict[str, tuple[int, ...]] = field(default_factory=dict)
     attributes: dict[str, dict[str, Any]] = field(default_factory=dict)
     left_out: dict[str, str] = field(default_factory=dict)
     told: list[str] = field(default_factory=list)

@@ -21,6 +21,8 @@ from adaptfault.data.recordings.facts.declared import too_large, too_much
 from adaptfault.data.recordings.formats.datasets import netcdf
 from adaptfault.data.recordings.formats.datasets.contents import Contents, element
 from adaptfault.data.recordings.formats.datasets.extra import imported
+from adaptfault.data.recordings.formats.datasets.features import VALID
+from adaptfault.data.recordings.formats.datasets.never_written import Written
 from adaptfault.data.recordings.formats.datasets.reader import reader
 
 SUFFIXES = (".h5", ".hdf5", ".hdf", ".he5", ".nc", ".nc4", ".cdf")
@@ -50,7 +52,8 @@ def opened(path: Path, names: Sequence[str] | None = None) -> Iterator[Contents]
         contents = Contents()
         if names is not None:
             for name in names:
-                contents.add(name, _array(_found(file, name)))
+                if not name.endswith(VALID) or name in file:  # others come with their arrays
+                    _add_array(contents, name, _found(file, name))
         else:
             with foreseeing(path, "is damaged ({}); copy it again"):
                 contents.attributes[""] = dict(file.attrs)
@@ -108,7 +111,19 @@ def _add(contents: Contents, name: str, found: Any, attributes: dict[str, Any]) 
     elif _EMPTY in attributes:
         contents.add(name, np.zeros(tuple(map(int, found[:].ravel()[::-1]))))
     else:
-        contents.add(name, _array(found), attributes)
+        _add_array(contents, name, found, attributes)
+
+
+def _add_array(
+    contents: Contents, name: str, found: Any, attributes: dict[str, Any] | None = None
+) -> None:
+    """Take in an array, and which of its readings were written; a mask of the file says more."""
+    contents.add(name, _array(found), attributes)
+    written = Written.of(found)
+    if written is not None:
+        contents.valid.setdefault(name, _as_seen(found, written))
+        ends = written.ends
+        contents.written[name] = ends[::-1] if _MATLAB in found.attrs else ends
 
 
 def _add_cells(file: Any, contents: Contents, name: str, found: Any) -> None:
@@ -135,7 +150,11 @@ def _refused(found: Any) -> str | None:
     size = math.prod(found.shape or ()) * found.dtype.itemsize
     if found.chunks is not None and (why := too_large(found.chunks, found.dtype.itemsize)):
         return why
-    return too_much(size, size if found.is_virtual else found.id.get_storage_size())
+    stored = size if found.is_virtual else found.id.get_storage_size()
+    why = too_much(size, stored)
+    if why is None and size and not stored:
+        why = "was never written, though it has a place in the file"
+    return why
 
 
 def _unreadable(error: str) -> str:
@@ -159,7 +178,12 @@ def _found(file: Any, name: str) -> Any:
 
 def _array(stored: Any) -> Any:
     """Return an array of a file, with its axes as its writer saw them."""
-    return Reversed(stored) if _MATLAB in stored.attrs else stored
+    return _as_seen(stored, stored)
+
+
+def _as_seen(stored: Any, array: Any) -> Any:
+    """Return what has the sizes of a stored array, with the axes as its writer has them."""
+    return Reversed(array) if _MATLAB in stored.attrs else array
 
 
 def _matlab_text(stored: Any) -> str | list[str] | None:

@@ -46,6 +46,7 @@ def opened(path: Path, names: Sequence[str] | None = None) -> Iterator[Contents]
     """
     if names is None:
         _contents.cache_clear()
+        _group.cache_clear()
     held = _contents(path, None if names is None else tuple(names))
     yield replace(held, attributes=dict(held.attributes))
 

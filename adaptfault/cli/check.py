@@ -116,11 +116,14 @@ class Check(Inspecting):
 
             refuse_foreign(self.write_valid)
         if self.write_copy:
+            from adaptfault.data.addresses import is_address
             from adaptfault.data.recordings.valid_copy import writer_of
 
             if len(self.recordings) > 1:
                 given = len(self.recordings)
                 raise ValueError(f"--write-copy takes one data set, got {given}: check each alone")
+            if is_address(self.recordings[0]):
+                raise ValueError("--write-copy takes a data set on this machine: copy it first")
             writer_of(self.write_copy, self.recordings[0])
         part = None if self.healthy is None else partial(_part, self.healthy)
         inspected = inspect_log(self, part)

@@ -87,7 +87,7 @@ def passed(place: Path) -> None:
         assert done.returncode == 1, done.stderr
         results.append(json.loads(out.read_text())["findings"])
     assert results[0] == results[1]
-    assert [one["cells"] for one in results[0]][0] == [DEAD], results[0]
+    assert results[0][0]["cells"] == [DEAD], results[0]
     copies = [file for file in (place / "cache").rglob("*") if file.is_file()]
     assert not [file for file in copies if file.suffix == ".mp4"]
     server.stop()

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Literal
 
 from adaptfault.cli.command import option
 from adaptfault.cli.inspecting import Inspecting, inspect_log, text_of, write_page
-from adaptfault.cli.paths import Read, Written, WrittenRecordings
+from adaptfault.cli.paths import Read, Written, WrittenFolder, WrittenRecordings
 from adaptfault.cli.reading import report_range
 from adaptfault.cli.shared_options import (
     cache_option,
@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from adaptfault.data.recordings import Opened, Recordings
     from adaptfault.inspection.data_set import DataSetCheck
     from adaptfault.inspection.findings import FailOn
+    from adaptfault.inspection.quick_statistics import Statistics
 
 
 class Check(Inspecting):
@@ -50,9 +51,15 @@ class Check(Inspecting):
         " recordings; no cell is tested"
     )
     shard: str | None = option(
-        "keep what one pass tells of the I-th of N parts of the recordings in the file of --out,"
-        " for --merge",
+        "I/N: keep what one pass tells of the I-th of N parts of the recordings in the file of"
+        " --out, for --merge; N: make all N parts, keep each in the folder of --keep, and check"
+        " the whole: a run that was killed goes on",
         "I/N",
+    )
+    keep: WrittenFolder | None = option("of the parts of --shard N", "FOLDER")
+    jobs: int | None = option("with --shard N: processes that read side by side (default 1)", "N")
+    dask: str | None = option(
+        "with --shard N: a Dask scheduler whose workers read, as tcp://host:8786", "ADDRESS"
     )
     merge: bool = option("the paths are parts that --shard wrote: check them as one data set")
     sample: int | None = option(
@@ -95,7 +102,8 @@ class Check(Inspecting):
         from adaptfault.inspection.findings import FailOn
 
         fails = None if self.fail_on is None else FailOn.parse(self.fail_on)
-        if self.quick or self.shard or self.merge or self.sample is not None:
+        in_parts = self.shard or self.merge or self.keep or self.jobs or self.dask
+        if self.quick or in_parts or self.sample is not None:
             self.quick = True
             return self._quick(fails)
         return self._full(fails)
@@ -172,7 +180,9 @@ class Check(Inspecting):
         self._refuse_beside_quick()
         log: Opened | None = None
         n_recordings = 0
-        if self.merge:
+        if self.keep:
+            statistics = self._in_parts()
+        elif self.merge:
             statistics = Statistics.joined([Statistics.load(path) for path in self.recordings])
         else:
             is_part = bool(self.shard) or self.sample is not None
@@ -182,7 +192,7 @@ class Check(Inspecting):
             divided = groupings_of(log, self.recordings)
             statistics = Statistics.of(log, divided)
             report_range(log)
-        if self.shard:
+        if self.shard and not self.keep:
             assert self.out is not None
             statistics.save(self.out)
             self.say(f"{len(statistics.naming.lengths)} recordings in {self.out}")
@@ -212,6 +222,22 @@ class Check(Inspecting):
         self._tell(checked, notes)
         return code
 
+    def _in_parts(self) -> Statistics:
+        """Return the statistics of a data set that is read in parts, which are kept."""
+        from pathlib import Path
+
+        from adaptfault.inspection.parts import Work, in_parts
+
+        assert self.shard is not None
+        assert self.keep is not None
+        work = Work(tuple(self.recordings), self.how_to_open(), int(self.shard))
+        statistics, there = in_parts(work, Path(self.keep), jobs=self.jobs or 1, dask=self.dask)
+        self.say(f"{there} of {work.parts} parts were in {self.keep} already")
+        for problem in statistics.unread:
+            self.complain(f"error: {problem}")
+        self.left_out += len(statistics.unread)
+        return statistics
+
     def _selected(self, n: int) -> Sequence[int]:
         """Return the numbers of the recordings of a shard, or of a sample, of ``n``."""
         if self.shard:
@@ -231,8 +257,15 @@ class Check(Inspecting):
             if getattr(self, name):
                 typed = "--" + name.replace("_", "-")
                 raise ValueError(f"{typed} needs tested cells: leave out --quick")
-        if self.shard and not self.out:
-            raise ValueError("--shard needs --out PART, the file for --merge")
+        if self.shard and self.shard.isdigit():
+            if not self.keep or not int(self.shard):
+                raise ValueError(f"--shard {self.shard} needs --keep FOLDER, and 1 part or more")
+        elif self.keep or self.jobs or self.dask:
+            raise ValueError("--keep, --jobs and --dask need --shard N, the number of all parts")
+        elif self.shard and not self.out:
+            raise ValueError("--shard I/N needs --out PART, the file for --merge")
+        if self.jobs is not None and self.jobs < 1:
+            raise ValueError(f"--jobs {self.jobs}: expected 1 or more")
         if self.sample is not None and self.sample < 1:
             raise ValueError(f"--sample {self.sample}: expected 1 recording or more")
         if sum(map(bool, (self.shard, self.merge, self.sample))) > 1:

@@ -170,6 +170,10 @@ class Statistics:
         Raises:
             OSError: it cannot be written.
         """
+        atomic_write(path, self.to_bytes())
+
+    def to_bytes(self) -> bytes:
+        """Return the content of the file."""
         about = {
             "schema": SCHEMA,
             "layout": self.layout.to_dict(),
@@ -194,7 +198,7 @@ class Statistics:
             between=self.repetitions.between,
             **{f"begins_{name}": values for name, values in vars(self.begins).items()},
         )
-        atomic_write(path, stored.getvalue())
+        return stored.getvalue()
 
     @classmethod
     def load(cls, path: str | PathLike[str]) -> Statistics:

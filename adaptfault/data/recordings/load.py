@@ -376,6 +376,17 @@ def open_recordings(
     return Opened(usable, known, inferred, tables, problems, values, n_found, scan)
 
 
+def local_paths(
+    paths: PathName | Iterable[PathName] | Any, stated: Mapping[str, Any]
+) -> list[Path]:
+    """Return where paths are read: addresses as their copies on this machine.
+
+    Args:
+        paths, stated: as for :func:`load`.
+    """
+    return [_place(path, stated, []) for path in _all(paths)]
+
+
 def _all(paths: PathName | Iterable[PathName] | Any) -> list[PathName]:
     """Return the paths that are given; that of a data set which says where it lies, as LeRobot's,
     is its ``root``."""

@@ -74,6 +74,9 @@ class Check(Inspecting):
     out: Written | None = option("write the result as JSON", "FILE")
     html: Written | None = option("write a page", "FILE")
     badge: Written | None = option("write a badge as SVG", "FILE")
+    table: Written | None = option(
+        "write the verdict of each cell in each recording as Parquet", "FILE"
+    )
     write_valid: WrittenRecordings | None = option(
         "write which readings are valid: .npz, .parquet, .zarr or .h5", "FILE"
     )
@@ -218,7 +221,7 @@ class Check(Inspecting):
             from adaptfault.inspection.sample_bound import bound_of_sample
 
             notes.append(bound_of_sample(found.inspection.diagnosis, n_recordings))
-        _write_result(self, checked)
+        _write_result(self, checked, statistics.classes)
         self._tell(checked, notes)
         return code
 
@@ -331,10 +334,15 @@ def _part(text: str, log: Opened) -> Recordings:
     return Recordings(frames, log.layout, names=log.names[begin:end])
 
 
-def _write_result(args: Check, checked: DataSetCheck) -> None:
-    """Write the result and the badge."""
+def _write_result(args: Check, checked: DataSetCheck, classes: Sequence[str] | None) -> None:
+    """Write the result, the badge and the table; ``classes``: of each recording."""
     from adaptfault.data.atomic import atomic_write
 
+    if args.table:
+        from adaptfault.inspection.verdict_table import write_table
+
+        diagnosis = checked.inspection.diagnosis
+        write_table(args.table, diagnosis, checked.naming.pads, classes)
     if args.out:
         atomic_write(args.out, json.dumps(checked.to_dict(), allow_nan=False).encode())
     if args.badge:
@@ -342,8 +350,10 @@ def _write_result(args: Check, checked: DataSetCheck) -> None:
 
 
 def _write(args: Check, log: Opened, checked: DataSetCheck, code: int, notes: list[str]) -> None:
+    from adaptfault.inspection.naming import classes_of
+
     diagnosis = checked.inspection.diagnosis
-    _write_result(args, checked)
+    _write_result(args, checked, classes_of(log))
     compared = bool(args.reference or args.healthy)
     write_page(args, diagnosis, code, notes, compared=compared, of_a_data_set=True)
     if args.write_valid:

@@ -158,3 +158,16 @@ def test_no_reading_time_or_class_is_left_behind(touch, others, single, data):
     assert {name for name in names if name.startswith(("tactile", "value"))} <= kept
     if touch:
         assert not {name for name in kept if name.startswith("joints")}
+
+
+def test_a_data_set_that_says_where_it_lies_is_read(root, tmp_path):
+    class OfLeRobot:
+        """What is asked of LeRobotDataset."""
+
+        def __init__(self, place):
+            self.root = place
+
+    root.get("/bucket/set", str(tmp_path / "set"), recursive=True)
+    for place in (tmp_path / "set", "memory://bucket/set"):
+        loaded = load(OfLeRobot(place), shape=(1, 2, 6), full_scale=1.0)
+        assert [frames.shape for frames in loaded.recordings.frames] == [(ROWS, 12)] * FILES

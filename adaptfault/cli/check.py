@@ -186,7 +186,7 @@ class Check(Inspecting):
         if self.keep:
             statistics = self._in_parts()
         elif self.merge:
-            statistics = Statistics.joined([Statistics.load(path) for path in self.recordings])
+            statistics = self._merged()
         else:
             is_part = bool(self.shard) or self.sample is not None
             log = self.open(self.recordings, select=self._selected if is_part else None)
@@ -218,12 +218,38 @@ class Check(Inspecting):
         code = checked.severity if fails is None else checked.findings.failed(fails)
         notes = []
         if self.sample is not None and log is not None:
-            from adaptfault.inspection.sample_bound import bound_of_sample
+            from adaptfault.inspection.sample_bound import SampleBound
 
-            notes.append(bound_of_sample(found.inspection.diagnosis, n_recordings))
+            bound = SampleBound.from_diagnosis(found.inspection.diagnosis, n_recordings)
+            checked = replace(checked, sample=bound)
+            notes.append(str(bound))
         _write_result(self, checked, statistics.classes)
         self._tell(checked, notes)
         return code
+
+    def _merged(self) -> Statistics:
+        """Return what parts tell together; one that is damaged is told, and the rest goes on."""
+        from adaptfault.data.recordings import InputError
+        from adaptfault.inspection.quick_statistics import Statistics
+
+        parts = []
+        problems = []
+        for path in self.recordings:
+            try:
+                parts.append(Statistics.load(path))
+            except InputError as error:
+                problems.append(error)
+        if not parts:
+            raise problems[0]
+        statistics = Statistics.joined(parts)
+        self._tell_unread([str(problem) for problem in problems])
+        return replace(statistics, unread=(*statistics.unread, *map(str, problems)))
+
+    def _tell_unread(self, reasons: Sequence[str]) -> None:
+        """Print why something could not be read; it makes the exit code 1 at least."""
+        from adaptfault.data.recordings import Problem
+
+        self.tell_problems([Problem("error", reason) for reason in reasons])
 
     def _in_parts(self) -> Statistics:
         """Return the statistics of a data set that is read in parts, which are kept."""
@@ -236,9 +262,7 @@ class Check(Inspecting):
         work = Work(tuple(self.recordings), self.how_to_open(), int(self.shard))
         statistics, there = in_parts(work, Path(self.keep), jobs=self.jobs or 1, dask=self.dask)
         self.say(f"{there} of {work.parts} parts were in {self.keep} already")
-        for problem in statistics.unread:
-            self.complain(f"error: {problem}")
-        self.left_out += len(statistics.unread)
+        self._tell_unread(statistics.unread)
         return statistics
 
     def _selected(self, n: int) -> Sequence[int]:

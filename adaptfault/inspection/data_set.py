@@ -24,6 +24,7 @@ from adaptfault.inspection.findings import Findings, Unchecked, unchecked_for_wa
 from adaptfault.inspection.leave_out import LeaveOut
 from adaptfault.inspection.naming import Naming
 from adaptfault.inspection.result import Finding, Inspection
+from adaptfault.inspection.sample_bound import SampleBound
 from adaptfault.inspection.severity import Name, of_finding
 from diagnostics import SensorLayout
 from diagnostics.when import reads_enough
@@ -53,6 +54,7 @@ class DataSetCheck:
         naming: of its pads and recordings.
         level: "full", or "quick" (:mod:`adaptfault.inspection.quick`).
         left_to_check: what a quick check leaves to the full one.
+        sample: what the recordings tell of all, where they were drawn; None: they are all.
     """
 
     inspection: Inspection
@@ -66,6 +68,7 @@ class DataSetCheck:
     naming: Naming = field(default_factory=Naming)
     level: Level = "full"
     left_to_check: tuple[Unchecked, ...] = ()
+    sample: SampleBound | None = None
 
     @property
     def healthy_share(self) -> float:
@@ -183,6 +186,7 @@ class DataSetCheck:
             "left_out": self.left_out,
             "begin_in_contact": list(self.begin_in_contact),
             "tared_in_contact": list(self.tared_in_contact),
+            "sample": None if self.sample is None else self.sample.to_dict(),
             "summary": self.summary.to_dict(),
             "inspection": self.inspection.to_dict(),
         }

@@ -271,8 +271,12 @@ def test_what_is_no_part_or_of_another_array_is_refused(stored, tmp_path, capsys
     other = str(tmp_path / "other.npz")
     assert main(["check", str(stored), "--full-scale", "5", "--shard", "1/2", "--out", other]) == 0
     capsys.readouterr()
-    assert main(["check", "--merge", str(stored), part]) == 3
+    assert main(["check", "--merge", str(stored)]) == 3
     assert "is no part of a check" in capsys.readouterr().err
+    assert main(["check", "--merge", str(stored), part]) == 1  # the rest goes on
+    captured = capsys.readouterr()
+    assert "is no part of a check" in captured.err
+    assert "TOUCH-191" in captured.out
     assert main(["check", "--merge", part, other]) == 3
     assert "not of one array" in capsys.readouterr().err
     for arguments in (["--shard", "3/2", "--out", other], ["--shard", "1/2"], ["--sample", "0"]):
@@ -280,10 +284,30 @@ def test_what_is_no_part_or_of_another_array_is_refused(stored, tmp_path, capsys
         assert "--shard" in (told := capsys.readouterr().err) or "--sample" in told
 
 
-def test_a_sample_says_how_many_recordings_hold_a_fault_at_most(stored, capsys):
-    assert main(["check", str(stored), "--sample", "20"]) in (0, 1)
+def test_a_sample_says_how_many_recordings_hold_a_fault_at_most(stored, tmp_path, capsys):
+    out = tmp_path / "sample.json"
+    assert main(["check", str(stored), "--sample", "20", "--out", str(out)]) == 1
     told = capsys.readouterr().out
     assert re.search(r"in \d+ of 20 recordings drawn from \d+: with 95% confidence", told)
+    document = json.loads(out.read_text())
+    jsonschema.validate(document, schema_of(document["schema"]))
+    one, many = document["sample"]["bounds"]
+    assert (one["cells"], many["cells"]) == (1, 4)  # a tenth of 36
+    assert many["found"] == 0
+    drawn, of = document["sample"]["drawn"], document["sample"]["of"]
+    assert one["most"] == most_faulty(one["found"], drawn, of)
+    assert many["most"] == most_faulty(0, drawn, of)
+
+
+@settings(max_examples=20, deadline=None)
+@given(faulty=st.integers(0, 40), drawn=st.integers(1, 40), seed=st.integers(0, 1000))
+def test_the_bound_of_a_sample_holds_for_the_whole(faulty, drawn, seed):
+    """Over many draws of one set, the bound is below the truth in at most one of twenty."""
+    rng = np.random.default_rng(seed)
+    holds = np.arange(40) < faulty
+    found = [int(rng.permutation(holds)[:drawn].sum()) for _ in range(300)]
+    missed = np.mean([most_faulty(k, drawn, 40) < faulty for k in found])
+    assert missed <= 0.05 + 4 * np.sqrt(0.05 * 0.95 / 300)
 
 
 @given(of=st.integers(1, 60), data=st.data())

@@ -171,3 +171,23 @@ def test_a_data_set_that_says_where_it_lies_is_read(root, tmp_path):
     for place in (tmp_path / "set", "memory://bucket/set"):
         loaded = load(OfLeRobot(place), shape=(1, 2, 6), full_scale=1.0)
         assert [frames.shape for frames in loaded.recordings.frames] == [(ROWS, 12)] * FILES
+
+
+@pytest.mark.parametrize("version", [2, 3])
+def test_of_a_zarr_store_the_pictures_are_not_read(version, root, read, tmp_path):
+    zarr = pytest.importorskip("zarr")
+    rng = np.random.default_rng(0)
+    store = zarr.open_group(tmp_path / "set.zarr", mode="w", zarr_format=version)
+    touch = rng.uniform(0, 1, (90, 3, 4)).astype(np.float32)
+    store.create_array("data/tactile", data=touch, chunks=(30, 3, 4))
+    store.create_array("data/camera_rgb", data=np.ones((90, 8, 8, 3), np.uint8))
+    store.create_array("meta/episode_ends", data=np.array([40, 90]))
+    for name in ("plain", "named.zarr"):
+        root.put(str(tmp_path / "set.zarr"), f"/stores/{name}", recursive=True)
+        read.clear()
+        recordings = load(f"memory://stores/{name}", full_scale=1.0).recordings
+        assert [len(frames) for frames in recordings.frames] == [40, 50]
+        np.testing.assert_array_equal(np.concatenate(recordings.frames), touch.reshape(90, 12))
+        pixels = [one for one in read if "camera" in one and "zarr.json" not in one]
+        assert not [one for one in pixels if not one.endswith((".zarray", ".zattrs"))]
+        root.rm(f"/stores/{name}", recursive=True)

@@ -1,10 +1,11 @@
 """Data sets at an address, as ``hf://datasets/me/touch`` or ``s3://bucket/touch``: what readers
 need of one is copied into a cache, through fsspec (extra "remote").
 
-Videos, pictures and whatever else no reader takes stay where they are. Of a Parquet file only the
-columns are copied that may hold touch, times, episodes or classes: lists that are no readings of
-touch, and bytes, are not. A file that was copied before is not read again, unless it changed, so
-that a run that was killed goes on. Credentials are those that fsspec finds in the environment.
+Videos, pictures and whatever else no reader takes stay where they are. Of a Parquet file or a Zarr
+store only the columns or arrays are copied that may hold touch, times, episodes or classes: lists
+that are no readings of touch, and bytes, are not. Other files are copied as they are. A file that
+was copied before is not read again, unless it changed, so that a run that was killed goes on.
+Credentials are those that fsspec finds in the environment.
 
 Not detected: a file that changed while its file system shows the same size, time and checksum.
 """
@@ -12,9 +13,10 @@ Not detected: a file that changed while its file system shows the same size, tim
 from __future__ import annotations
 
 import hashlib
+import json
 import os
 import re
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from contextlib import suppress
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -27,7 +29,9 @@ from adaptfault.data.recordings.readers import Reader, suffixes
 
 _TABLES = (".parquet", ".pq")
 _TEXTS = (".json", ".jsonl", ".toml", ".csv")  # what describes recordings, whatever readers take
-_STORES = (".zarray", ".zgroup", ".zattrs", ".zmetadata", "zarr.json")
+_ARRAYS = (".zarray", "zarr.json")  # what describes an array of a Zarr store
+_STORES = (*_ARRAYS, ".zgroup", ".zattrs", ".zmetadata")
+_PICTURES = re.compile(r"image|rgb|depth|video|camera|pixel", re.IGNORECASE)
 _SAME = ".same"  # ends the name of what says which version of a file was copied
 _CACHE = "ADAPTFAULT_CACHE"
 _PIECE = 1 << 22  # bytes that are copied at once: a size
@@ -63,32 +67,62 @@ def fetched(
         raise InputError.at(address, "is not there; check the address")
     copy = _cache() / _safe(address) / PurePosixPath(root).name
     is_file = list(listed) == [root]
-    wanted = {name: about for name, about in listed.items() if _is_wanted(name, root, known)}
-    kept = set()
-    for name in sorted(wanted):
-        place = copy if is_file else copy / PurePosixPath(name).relative_to(root)
-        try:
-            _copied(files, name, wanted[name], place, key)
-        except Exception as error:
-            what = f"cannot be read ({_line(error)}): left out"
-            problems.append(Problem("error", located(f"{address}: {name}", what)))
-            continue
-        kept.add(place)
+    wanted = [name for name in listed if _is_wanted(name, known)]
+    folders = {str(PurePosixPath(name).parent) for name in wanted if _last(name) in _STORES}
+    pieces = [name for name in listed if name not in wanted and _is_below(name, folders)]
+    kept: dict[Path, str] = {}
+    arrays: list[str] = []
+    for some in (wanted, pieces):
+        for name in sorted(some):
+            if some is pieces and not _is_below(name, arrays):
+                continue
+            place = copy if is_file else copy / PurePosixPath(name).relative_to(root)
+            try:
+                _copied(files, name, listed[name], place, key)
+            except Exception as error:
+                what = f"cannot be read ({_line(error)}): left out"
+                problems.append(Problem("error", located(f"{address}: {name}", what)))
+                continue
+            kept[place] = name
+        if some is wanted:
+            arrays = _arrays(kept, key)
     if not kept:
         first = f"; {problems[0].message}" if problems else ""
         raise InputError.at(address, f"is no recording, or holds none that can be read{first}")
     if not is_file:
-        _forget_others(copy, kept)
+        _forget_others(copy, set(kept))
     return copy
 
 
-def _is_wanted(name: str, root: str, known: Mapping[str, Reader]) -> bool:
-    """Return whether a reader takes a file: by its name, or as a piece of a Zarr store."""
-    inner = name.removeprefix(root).lower()
-    last = PurePosixPath(name).name.lower()
-    if inner.endswith((*suffixes(known), *_TEXTS)) or last in _STORES:
-        return True
-    return ".zarr/" in f"{PurePosixPath(root).name.lower()}/{inner}"
+def _last(name: str) -> str:
+    return PurePosixPath(name).name.lower()
+
+
+def _is_wanted(name: str, known: Mapping[str, Reader]) -> bool:
+    """Return whether a reader takes a file by its name, or it describes a Zarr store."""
+    return name.lower().endswith((*suffixes(known), *_TEXTS)) or _last(name) in _STORES
+
+
+def _is_below(name: str, folders: Collection[str]) -> bool:
+    """Return whether a file lies in one of some folders, or below it."""
+    return any(str(folder) in folders for folder in PurePosixPath(name).parents)
+
+
+def _arrays(copied: Mapping[Path, str], key: str | None) -> list[str]:
+    """Return the folders of those arrays of Zarr stores that a reader may need.
+
+    Args:
+        copied: what was copied, and what it is called at the address.
+        key: as for :func:`fetched`.
+    """
+    sizes: dict[str, tuple[int, ...]] = {}
+    for place, name in copied.items():
+        if _last(name) in _ARRAYS:
+            with suppress(ValueError):
+                shape = json.loads(place.read_text()).get("shape")
+                if isinstance(shape, list):
+                    sizes[str(PurePosixPath(name).parent)] = tuple(shape[1:])
+    return _needed(sizes, key)
 
 
 def _copied(files: Any, name: str, about: Any, place: Path, key: str | None) -> None:
@@ -138,7 +172,6 @@ def needed(columns: Any, key: str | None) -> list[str]:
         key: as for :func:`fetched`.
     """
     types = imported("pyarrow.types", "")
-    single: list[str] = []
     sizes: dict[str, tuple[int, ...]] = {}
     for field in columns:
         kind = field.type
@@ -146,13 +179,17 @@ def needed(columns: Any, key: str | None) -> list[str]:
             continue
         is_single = not types.is_nested(kind) and not hasattr(kind, "storage_type")
         sizes[field.name] = () if is_single else (2,)  # how many there are does not matter here
-        if is_single:
-            single.append(field.name)
+    return _needed(sizes, key)
+
+
+def _needed(sizes: Mapping[str, tuple[int, ...]], key: str | None) -> list[str]:
+    """Return which of some arrays a reader may need, of the sizes of a frame in each."""
     try:
         chosen = choose(Path(), sizes, key)
     except InputError:  # several may be meant, or none: told by the reader
-        return list(sizes)
+        return [name for name, one in sizes.items() if len(one) < 2 or not _PICTURES.search(name)]
     masks = [name for name in sizes if name.removesuffix(VALID) in chosen]
+    single = [name for name, one in sizes.items() if not one]
     return list(dict.fromkeys([*chosen, *masks, *single]))
 
 

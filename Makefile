@@ -74,7 +74,7 @@ lerobot-check:
 	build/lerobot/bin/python -m pip install --quiet --disable-pip-version-check '.[datasets]' lerobot==0.4.4
 	build/lerobot/bin/python tests/check_lerobot.py
 
-# A store in the manner of S3 that runs here, and a Hub that does not answer: an environment of its own.
+# A store in the manner of S3 and a Hub that run here, and ones that do not answer: an environment of its own.
 remote-check:
 	test -e build/remote/bin/python || $(PYTHON) -m venv build/remote
 	build/remote/bin/python -m pip install --quiet --disable-pip-version-check $(CONSTRAINTS) '.[datasets,remote]' 'moto[server,s3]>=5'

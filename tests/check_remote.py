@@ -1,5 +1,5 @@
-"""Takes a data set from a store in the manner of S3 that runs here, and asks a Hub that does not
-answer: python tests/check_remote.py
+"""Takes a data set from a store in the manner of S3 and from a Hub in that of Hugging Face, which
+run here, and asks ones that do not answer: python tests/check_remote.py
 
 Not a test of pytest's: s3fs, moto and huggingface_hub bring fifty packages. ``make remote-check``
 makes an environment for it.
@@ -7,12 +7,16 @@ makes an environment for it.
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import subprocess
 import sys
 import tempfile
+from collections import Counter
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from threading import Thread
 
 import boto3
 import numpy as np
@@ -62,6 +66,66 @@ def check(address: str, out: Path, **environment: str) -> subprocess.CompletedPr
     )
 
 
+class Hub(ThreadingHTTPServer):
+    """A Hub with one data set, me/touch.
+
+    Args:
+        root: the folder of the set.
+
+    Attributes:
+        sent: bytes of each file that were asked for.
+    """
+
+    def __init__(self, root: Path) -> None:
+        super().__init__(("127.0.0.1", 0), _Asked)
+        self.root = root
+        self.sent: Counter[str] = Counter()
+        Thread(target=self.serve_forever, daemon=True).start()
+
+
+class _Asked(BaseHTTPRequestHandler):
+    """One request to the Hub."""
+
+    server: Hub
+
+    def log_message(self, format: str, *args: object) -> None:
+        """Print nothing."""
+
+    def do_GET(self) -> None:
+        """Answer what the set holds, or with a part of a file."""
+        where = self.path.partition("?")[0]
+        root = self.server.root
+        if "/resolve/" in where:
+            name = where.partition("/resolve/")[2].partition("/")[2]
+            whole = (root / name).read_bytes()
+            first, last = (self.headers.get("Range") or "=0-").partition("=")[2].split("-")
+            part = whole[int(first) : int(last or len(whole)) + 1]
+            self.server.sent[name] += len(part)
+            until = int(first) + len(part) - 1
+            self._send(part, 206, {"Content-Range": f"bytes {first}-{until}/{len(whole)}"})
+        elif "/tree/" in where:
+            held = [_entry(file, root) for file in sorted(root.rglob("*"))]
+            self._send(json.dumps(held).encode())
+        else:
+            self._send(json.dumps({"id": "me/touch", "sha": "0" * 40, "siblings": []}).encode())
+
+    def _send(self, body: bytes, code: int = 200, about: dict[str, str] | None = None) -> None:
+        self.send_response(code)
+        for name, value in {"Content-Length": str(len(body)), **(about or {})}.items():
+            self.send_header(name, value)
+        self.end_headers()
+        self.wfile.write(body)
+
+
+def _entry(file: Path, root: Path) -> dict[str, object]:
+    """Return how the Hub lists a file or a folder."""
+    path = str(file.relative_to(root))
+    about = {"path": path, "oid": hashlib.sha1(path.encode()).hexdigest()}
+    if file.is_dir():
+        return {**about, "type": "directory", "size": 0}
+    return {**about, "type": "file", "size": file.stat().st_size}
+
+
 def passed(place: Path) -> None:
     """Upload the set, check it there and here, and compare."""
     written(place / "touch")
@@ -80,13 +144,21 @@ def passed(place: Path) -> None:
     store.create_bucket(Bucket="sets")
     for file in (place / "touch").rglob("*.*"):
         store.upload_file(str(file), "sets", f"touch/{file.relative_to(place / 'touch')}")
+    hub = Hub(place / "touch")
+    there = {"HF_ENDPOINT": f"http://127.0.0.1:{hub.server_port}"}
     results = []
-    for number, address in enumerate(("s3://sets/touch", str(place / "touch"))):
+    addresses = ("s3://sets/touch", "hf://datasets/me/touch", str(place / "touch"))
+    for number, address in enumerate(addresses):
         out = place / f"{number}.json"
-        done = check(address, out)
+        done = check(address, out, **there)
         assert done.returncode == 1, done.stderr
         results.append(json.loads(out.read_text())["findings"])
-    assert results[0] == results[1]
+    assert results[0] == results[1] == results[2]
+    table = "data/chunk-000/file-000.parquet"
+    size = (place / "touch" / table).stat().st_size
+    print(f"of {size:,} bytes of the table {hub.sent[table]:,} were read, of the video none")
+    assert hub.sent[table] < size / 3, "the state was read, too"
+    assert set(hub.sent) == {table, "meta/info.json"}
     assert results[0][0]["cells"] == [DEAD], results[0]
     copies = [file for file in (place / "cache").rglob("*") if file.is_file()]
     assert not [file for file in copies if file.suffix == ".mp4"]

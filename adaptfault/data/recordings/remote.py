@@ -133,11 +133,13 @@ def _copied(files: Any, name: str, about: Any, place: Path, key: str | None) -> 
         if place.is_file() and same.read_text() == version:
             return
     place.parent.mkdir(parents=True, exist_ok=True)
-    with atomic_file(place) as new, files.open(name, "rb") as file:
+    with atomic_file(place) as new:
         if name.lower().endswith(_TABLES):
-            _copy_columns(file, new, key)
+            # without a cache that reads ahead: what lies between the columns is not wanted
+            with files.open(name, "rb", cache_type="none") as file:
+                _copy_columns(file, new, key)
         else:
-            with new.open("wb") as written:
+            with files.open(name, "rb") as file, new.open("wb") as written:
                 while piece := file.read(_PIECE):
                     written.write(piece)
     atomic_write(same, version.encode())
@@ -152,7 +154,7 @@ def _version(about: Mapping[str, Any]) -> dict[str, str]:
 def _copy_columns(file: Any, new: Path, key: str | None) -> None:
     """Copy the columns of a Parquet file that a reader may need."""
     parquet = imported("pyarrow.parquet", new)
-    held = parquet.ParquetFile(file)
+    held = parquet.ParquetFile(file, pre_buffer=True)  # neighbouring columns in one request
     columns = held.schema_arrow
     wanted = needed(columns, key)
     kept = [field for field in columns if field.name in wanted]

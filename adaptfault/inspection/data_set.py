@@ -54,6 +54,8 @@ class DataSetCheck:
         naming: of its pads and recordings.
         level: "full", or "quick" (:mod:`adaptfault.inspection.quick`).
         left_to_check: what a quick check leaves to the full one.
+        stood_still: that the stream stood still in some recordings, in one sentence; None: in
+            none.
         sample: what the recordings tell of all, where they were drawn; None: they are all.
     """
 
@@ -68,6 +70,7 @@ class DataSetCheck:
     naming: Naming = field(default_factory=Naming)
     level: Level = "full"
     left_to_check: tuple[Unchecked, ...] = ()
+    stood_still: str | None = None
     sample: SampleBound | None = None
 
     @property
@@ -128,6 +131,8 @@ class DataSetCheck:
         if self.clock.jitter is not None and self.clock.jitter > _JITTER:
             text = f"the period between frames varies by {self.clock.jitter:.0%}"
             found.append(("jitter", text))
+        if self.stood_still and "frozen" not in {one.name for one in self.inspection.findings}:
+            found.append(("frozen", self.stood_still))
         if self.begin_in_contact:
             begun = _counted(self.begin_in_contact)
             text = f"{begun}: harmless, unless the driver tares at the start"

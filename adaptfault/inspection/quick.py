@@ -172,6 +172,7 @@ def quick_check(
         naming,
         "quick",
         left,
+        stood_still=statistics.stands_still.told(naming.recordings),
     )
 
 

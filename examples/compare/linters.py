@@ -171,10 +171,11 @@ def cells_named(tool: Tool, said: str, out: Path) -> set[int]:
     return cells
 
 
-def timed(command: Sequence[str]) -> tuple[float, int, str]:
-    """Run a command; return its processor time in seconds, its exit code and what it said."""
+def timed(command: Sequence[str], place: str) -> tuple[float, int, str]:
+    """Run a command in a folder, as some write there; return its processor time in seconds, its
+    exit code and what it said."""
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=place)
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     seconds = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
     return seconds, done.returncode, done.stdout + done.stderr
@@ -182,7 +183,7 @@ def timed(command: Sequence[str]) -> tuple[float, int, str]:
 
 def others(environment: Path) -> list[Tool]:
     """Return the tools of others, installed where they are not yet."""
-    scripts = environment / "bin"
+    scripts = environment.resolve() / "bin"
     if not (scripts / "rda").exists():
         subprocess.run([sys.executable, "-m", "venv", str(environment)], check=True)
         install = [str(scripts / "python"), "-m", "pip", "install", "--quiet", *VERSIONS]
@@ -222,7 +223,7 @@ def main() -> None:
             for tool in compared:
                 out = Path(place, "out.json")
                 more = ("--out", str(out), *STATED) if tool.is_ours else ()
-                ran = [timed((*tool.command, str(folder), *more)) for _ in range(args.runs)]
+                ran = [timed((*tool.command, str(folder), *more), place) for _ in range(args.runs)]
                 named = cells_named(tool, ran[0][2], out)
                 seconds = min(one[0] for one in ran)
                 counts = f"{len(named & truth)} of {len(truth)} | {len(named - truth)}"

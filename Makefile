@@ -14,7 +14,7 @@ INSTALL = $(BIN)/python -m pip install --quiet --no-compile --disable-pip-versio
 CONSTRAINTS := -c constraints.txt
 PACKAGES := $(wildcard packages/*)
 
-.PHONY: demo test test-all test-cpus check quick-tests all-tests examples benchmark docs wheel-check lerobot-check findings test-pythons install-dev format clean
+.PHONY: demo test test-all test-cpus check quick-tests all-tests examples benchmark docs wheel-check lerobot-check remote-check findings test-pythons install-dev format clean
 
 demo: .venv/installed
 	$(BIN)/adaptfault demo
@@ -73,6 +73,12 @@ lerobot-check:
 	test -e build/lerobot/bin/python || $(PYTHON) -m venv build/lerobot
 	build/lerobot/bin/python -m pip install --quiet --disable-pip-version-check '.[datasets]' lerobot==0.4.4
 	build/lerobot/bin/python tests/check_lerobot.py
+
+# A store in the manner of S3 and a Hub that run here, and ones that do not answer: an environment of its own.
+remote-check:
+	test -e build/remote/bin/python || $(PYTHON) -m venv build/remote
+	build/remote/bin/python -m pip install --quiet --disable-pip-version-check $(CONSTRAINTS) '.[datasets,remote]' 'moto[server,s3]>=5'
+	build/remote/bin/python tests/check_remote.py
 
 # Each installs what it names from PyPI; one after the other, and all of them although one fails.
 findings:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Literal
 
 from adaptfault.cli.command import option
 from adaptfault.cli.inspecting import Inspecting, inspect_log, text_of, write_page
-from adaptfault.cli.paths import Read, Written, WrittenRecordings
+from adaptfault.cli.paths import Read, Written, WrittenFolder, WrittenRecordings
 from adaptfault.cli.reading import report_range
 from adaptfault.cli.shared_options import (
     cache_option,
@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from adaptfault.data.recordings import Opened, Recordings
     from adaptfault.inspection.data_set import DataSetCheck
     from adaptfault.inspection.findings import FailOn
+    from adaptfault.inspection.quick_statistics import Statistics
 
 
 class Check(Inspecting):
@@ -50,9 +51,15 @@ class Check(Inspecting):
         " recordings; no cell is tested"
     )
     shard: str | None = option(
-        "keep what one pass tells of the I-th of N parts of the recordings in the file of --out,"
-        " for --merge",
+        "I/N: keep what one pass tells of the I-th of N parts of the recordings in the file of"
+        " --out, for --merge; N: make all N parts, keep each in the folder of --keep, and check"
+        " the whole: a run that was killed goes on",
         "I/N",
+    )
+    keep: WrittenFolder | None = option("of the parts of --shard N", "FOLDER")
+    jobs: int | None = option("with --shard N: processes that read side by side (default 1)", "N")
+    dask: str | None = option(
+        "with --shard N: a Dask scheduler whose workers read, as tcp://host:8786", "ADDRESS"
     )
     merge: bool = option("the paths are parts that --shard wrote: check them as one data set")
     sample: int | None = option(
@@ -67,6 +74,9 @@ class Check(Inspecting):
     out: Written | None = option("write the result as JSON", "FILE")
     html: Written | None = option("write a page", "FILE")
     badge: Written | None = option("write a badge as SVG", "FILE")
+    table: Written | None = option(
+        "write the verdict of each cell in each recording as Parquet", "FILE"
+    )
     write_valid: WrittenRecordings | None = option(
         "write which readings are valid: .npz, .parquet, .zarr or .h5", "FILE"
     )
@@ -95,7 +105,8 @@ class Check(Inspecting):
         from adaptfault.inspection.findings import FailOn
 
         fails = None if self.fail_on is None else FailOn.parse(self.fail_on)
-        if self.quick or self.shard or self.merge or self.sample is not None:
+        in_parts = self.shard or self.merge or self.keep or self.jobs or self.dask
+        if self.quick or in_parts or self.sample is not None:
             self.quick = True
             return self._quick(fails)
         return self._full(fails)
@@ -116,11 +127,14 @@ class Check(Inspecting):
 
             refuse_foreign(self.write_valid)
         if self.write_copy:
+            from adaptfault.data.addresses import is_address
             from adaptfault.data.recordings.valid_copy import writer_of
 
             if len(self.recordings) > 1:
                 given = len(self.recordings)
                 raise ValueError(f"--write-copy takes one data set, got {given}: check each alone")
+            if is_address(self.recordings[0]):
+                raise ValueError("--write-copy takes a data set on this machine: copy it first")
             writer_of(self.write_copy, self.recordings[0])
         part = None if self.healthy is None else partial(_part, self.healthy)
         inspected = inspect_log(self, part)
@@ -169,8 +183,10 @@ class Check(Inspecting):
         self._refuse_beside_quick()
         log: Opened | None = None
         n_recordings = 0
-        if self.merge:
-            statistics = Statistics.joined([Statistics.load(path) for path in self.recordings])
+        if self.keep:
+            statistics = self._in_parts()
+        elif self.merge:
+            statistics = self._merged()
         else:
             is_part = bool(self.shard) or self.sample is not None
             log = self.open(self.recordings, select=self._selected if is_part else None)
@@ -179,7 +195,7 @@ class Check(Inspecting):
             divided = groupings_of(log, self.recordings)
             statistics = Statistics.of(log, divided)
             report_range(log)
-        if self.shard:
+        if self.shard and not self.keep:
             assert self.out is not None
             statistics.save(self.out)
             self.say(f"{len(statistics.naming.lengths)} recordings in {self.out}")
@@ -202,12 +218,52 @@ class Check(Inspecting):
         code = checked.severity if fails is None else checked.findings.failed(fails)
         notes = []
         if self.sample is not None and log is not None:
-            from adaptfault.inspection.sample_bound import bound_of_sample
+            from adaptfault.inspection.sample_bound import SampleBound
 
-            notes.append(bound_of_sample(found.inspection.diagnosis, n_recordings))
-        _write_result(self, checked)
+            bound = SampleBound.from_diagnosis(found.inspection.diagnosis, n_recordings)
+            checked = replace(checked, sample=bound)
+            notes.append(str(bound))
+        _write_result(self, checked, statistics.classes)
         self._tell(checked, notes)
         return code
+
+    def _merged(self) -> Statistics:
+        """Return what parts tell together; one that is damaged is told, and the rest goes on."""
+        from adaptfault.data.recordings import InputError
+        from adaptfault.inspection.quick_statistics import Statistics
+
+        parts = []
+        problems = []
+        for path in self.recordings:
+            try:
+                parts.append(Statistics.load(path))
+            except InputError as error:
+                problems.append(error)
+        if not parts:
+            raise problems[0]
+        statistics = Statistics.joined(parts)
+        self._tell_unread([str(problem) for problem in problems])
+        return replace(statistics, unread=(*statistics.unread, *map(str, problems)))
+
+    def _tell_unread(self, reasons: Sequence[str]) -> None:
+        """Print why something could not be read; it makes the exit code 1 at least."""
+        from adaptfault.data.recordings import Problem
+
+        self.tell_problems([Problem("error", reason) for reason in reasons])
+
+    def _in_parts(self) -> Statistics:
+        """Return the statistics of a data set that is read in parts, which are kept."""
+        from pathlib import Path
+
+        from adaptfault.inspection.parts import Work, in_parts
+
+        assert self.shard is not None
+        assert self.keep is not None
+        work = Work(tuple(self.recordings), self.how_to_open(), int(self.shard))
+        statistics, there = in_parts(work, Path(self.keep), jobs=self.jobs or 1, dask=self.dask)
+        self.say(f"{there} of {work.parts} parts were in {self.keep} already")
+        self._tell_unread(statistics.unread)
+        return statistics
 
     def _selected(self, n: int) -> Sequence[int]:
         """Return the numbers of the recordings of a shard, or of a sample, of ``n``."""
@@ -228,8 +284,15 @@ class Check(Inspecting):
             if getattr(self, name):
                 typed = "--" + name.replace("_", "-")
                 raise ValueError(f"{typed} needs tested cells: leave out --quick")
-        if self.shard and not self.out:
-            raise ValueError("--shard needs --out PART, the file for --merge")
+        if self.shard and self.shard.isdigit():
+            if not self.keep or not int(self.shard):
+                raise ValueError(f"--shard {self.shard} needs --keep FOLDER, and 1 part or more")
+        elif self.keep or self.jobs or self.dask:
+            raise ValueError("--keep, --jobs and --dask need --shard N, the number of all parts")
+        elif self.shard and not self.out:
+            raise ValueError("--shard I/N needs --out PART, the file for --merge")
+        if self.jobs is not None and self.jobs < 1:
+            raise ValueError(f"--jobs {self.jobs}: expected 1 or more")
         if self.sample is not None and self.sample < 1:
             raise ValueError(f"--sample {self.sample}: expected 1 recording or more")
         if sum(map(bool, (self.shard, self.merge, self.sample))) > 1:
@@ -295,10 +358,15 @@ def _part(text: str, log: Opened) -> Recordings:
     return Recordings(frames, log.layout, names=log.names[begin:end])
 
 
-def _write_result(args: Check, checked: DataSetCheck) -> None:
-    """Write the result and the badge."""
+def _write_result(args: Check, checked: DataSetCheck, classes: Sequence[str] | None) -> None:
+    """Write the result, the badge and the table; ``classes``: of each recording."""
     from adaptfault.data.atomic import atomic_write
 
+    if args.table:
+        from adaptfault.inspection.verdict_table import write_table
+
+        diagnosis = checked.inspection.diagnosis
+        write_table(args.table, diagnosis, checked.naming.pads, classes)
     if args.out:
         atomic_write(args.out, json.dumps(checked.to_dict(), allow_nan=False).encode())
     if args.badge:
@@ -306,8 +374,10 @@ def _write_result(args: Check, checked: DataSetCheck) -> None:
 
 
 def _write(args: Check, log: Opened, checked: DataSetCheck, code: int, notes: list[str]) -> None:
+    from adaptfault.inspection.naming import classes_of
+
     diagnosis = checked.inspection.diagnosis
-    _write_result(args, checked)
+    _write_result(args, checked, classes_of(log))
     compared = bool(args.reference or args.healthy)
     write_page(args, diagnosis, code, notes, compared=compared, of_a_data_set=True)
     if args.write_valid:

@@ -14,6 +14,8 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from adaptfault.data.addresses import is_address
+
 if TYPE_CHECKING:
     from adaptfault.cli.command import Command
 
@@ -78,7 +80,8 @@ def check_paths(command: Command) -> None:
     inputs = list(_paths(command, Read))
     for _, path in inputs:
         # an empty path, as of a shell variable that is not set, is none either
-        if not isinstance(path, Stated) and not os.path.lexists(path):
+        is_elsewhere = isinstance(path, Stated) or is_address(path)
+        if not is_elsewhere and not os.path.lexists(path):
             raise ValueError(f"{path or repr(path)}: is not there; check the path")
     _check_model(command)
     outputs = list(_paths(command, Written))

@@ -199,15 +199,16 @@ class Reading(CalibratedArray):
 
         with self._bar() as advance:
             opened = open_recordings(
-                paths,
-                labels=self.labels,
-                frames=self.frames,
-                progress=advance,
-                select=select,
-                **self._options_of_load(layout),
+                paths, progress=advance, select=select, **self.how_to_open(layout)
             )
         self.tell_problems(opened.problems)
         return opened
+
+    def how_to_open(self, layout: SensorLayout | None = None) -> dict[str, Any]:
+        """Return what the options state, as ``adaptfault.data.recordings.open_recordings`` takes
+        it; ``layout`` as for :meth:`load`."""
+        options = {"labels": self.labels, "frames": self.frames}
+        return {**options, **self._options_of_load(layout)}
 
     @contextmanager
     def _bar(self) -> Iterator[Callable[[int], None]]:

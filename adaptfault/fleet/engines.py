@@ -48,6 +48,21 @@ def engine(task: Task, *, jobs: int | None, dask: str | None) -> Iterator[Engine
                 for guard in guards:
                     guard.close()
         return
+    with connected(dask) as client:
+        yield partial(_on_dask, client, task)
+
+
+@contextmanager
+def connected(dask: str) -> Iterator[Client]:
+    """Return the client of a Dask scheduler that has a worker.
+
+    Args:
+        dask: its address, as ``tcp://host:8786``.
+
+    Raises:
+        ValueError: Dask is not installed, or the address has no port.
+        OSError: no scheduler answers at the address, or it has no worker.
+    """
     try:
         from distributed import Client
     except ImportError:
@@ -62,7 +77,7 @@ def engine(task: Task, *, jobs: int | None, dask: str | None) -> Iterator[Engine
             raise OSError(
                 f"the Dask scheduler at {dask} has no worker after {_WAIT} s ({error})"
             ) from None
-        yield partial(_on_dask, client, task)
+        yield client
 
 
 def _on_joblib(task: Task, guards: Sequence[Guard], robots: Sequence[Robot]) -> Iterator[Outcome]:

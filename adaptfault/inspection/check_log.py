@@ -16,6 +16,7 @@ from adaptfault.inspection.code import Need
 from adaptfault.inspection.data_set import DataSetCheck
 from adaptfault.inspection.naming import Naming
 from adaptfault.inspection.result import Inspection
+from adaptfault.inspection.stands_still import StandsStill
 from diagnostics.preprocessing.readings import RecordingBlocks
 from diagnostics.sensor.shared import measured
 
@@ -57,6 +58,7 @@ def check_log(
     begins = Begins.of(recordings(), log.layout)
     begun, tared = begins.in_contact(log.names, log.layout)
     naming = Naming.of(log)
+    still = StandsStill.of(([frames] for frames in log), log.layout)
     return DataSetCheck(
         naming.of_inspection(inspection),
         summary,
@@ -67,4 +69,5 @@ def check_log(
         frozenset(given),
         source,
         naming,
+        stood_still=still.told(naming.recordings),
     )

@@ -401,7 +401,8 @@ CODES: tuple[Code, ...] = (
     Code(
         190,
         "untested",
-        "So few cells were tested that faults may be hidden, or none of a pad.",
+        "So few cells were tested that faults may be hidden, none of a pad, or none at all: a quick"
+        " check tests none.",
         "What was not tested is not healthy.",
         "Contacts that would test more are told.",
         "What contacts a policy will meet that the data set does not hold.",

@@ -24,6 +24,7 @@ from adaptfault.inspection.findings import Findings, Unchecked, unchecked_for_wa
 from adaptfault.inspection.leave_out import LeaveOut
 from adaptfault.inspection.naming import Naming
 from adaptfault.inspection.result import Finding, Inspection
+from adaptfault.inspection.sample_bound import SampleBound
 from adaptfault.inspection.severity import Name, of_finding
 from diagnostics import SensorLayout
 from diagnostics.when import reads_enough
@@ -53,6 +54,9 @@ class DataSetCheck:
         naming: of its pads and recordings.
         level: "full", or "quick" (:mod:`adaptfault.inspection.quick`).
         left_to_check: what a quick check leaves to the full one.
+        stood_still: that the stream stood still in some recordings, in one sentence; None: in
+            none.
+        sample: what the recordings tell of all, where they were drawn; None: they are all.
     """
 
     inspection: Inspection
@@ -66,6 +70,8 @@ class DataSetCheck:
     naming: Naming = field(default_factory=Naming)
     level: Level = "full"
     left_to_check: tuple[Unchecked, ...] = ()
+    stood_still: str | None = None
+    sample: SampleBound | None = None
 
     @property
     def healthy_share(self) -> float:
@@ -125,6 +131,8 @@ class DataSetCheck:
         if self.clock.jitter is not None and self.clock.jitter > _JITTER:
             text = f"the period between frames varies by {self.clock.jitter:.0%}"
             found.append(("jitter", text))
+        if self.stood_still and "frozen" not in {one.name for one in self.inspection.findings}:
+            found.append(("frozen", self.stood_still))
         if self.begin_in_contact:
             begun = _counted(self.begin_in_contact)
             text = f"{begun}: harmless, unless the driver tares at the start"
@@ -183,6 +191,7 @@ class DataSetCheck:
             "left_out": self.left_out,
             "begin_in_contact": list(self.begin_in_contact),
             "tared_in_contact": list(self.tared_in_contact),
+            "sample": None if self.sample is None else self.sample.to_dict(),
             "summary": self.summary.to_dict(),
             "inspection": self.inspection.to_dict(),
         }

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Iterable
-from os import PathLike, fspath
+from os import PathLike
 from typing import Any
 
 from adaptfault.data.recordings import Opened, Recordings, open_recordings
@@ -48,8 +48,7 @@ def guard(
     ``unchecked`` of what is returned.
 
     Args:
-        dataset: recordings; paths, as :func:`adaptfault.load` takes them; or a data set with the
-            folder that holds it as ``root``, as LeRobot's.
+        dataset: recordings; or paths or a data set, as :func:`adaptfault.load` takes them.
         on: what raises: ``"error"``, ``"warning"``, ``"notice"``, ``"never"``, codes and begins of
             codes, divided by commas, as ``check --fail-on``.
         reference: healthy recordings of the same array; None: the data set is its own.
@@ -96,9 +95,6 @@ def _opened(dataset: Any, stated: dict[str, Any]) -> Opened | Recordings:
         if stated:
             raise ValueError(f"{', '.join(stated)}: of recordings in memory nothing is read")
         return dataset
-    root = getattr(dataset, "root", None)
-    if isinstance(root, str | PathLike) and not isinstance(dataset, str | PathLike):
-        return open_recordings(fspath(root), **stated)
     return open_recordings(dataset, **stated)
 
 

@@ -7,7 +7,8 @@ of a data set nor how it is cut matters.
 Found are cells and wires that hold a value in some recordings although those beside them move
 (:mod:`diagnostics.when`), as the whole check finds them. No cell is called ALIVE: that a cell
 answers together with those beside it (:mod:`diagnostics.when.together`) shows contact, and is
-no test of what it reads. What only the whole check tells is listed as not checked.
+no test of what it reads. So cells in which nothing is found are UNTESTED, a finding of its own says
+so, and the exit code is 1. What only the whole check tells is listed as not checked.
 
 Not detected: cells that are dead from the first recording to the last, that move by themselves,
 late, in part, or as another one does, drift and noise, and what the whole array shares.
@@ -27,7 +28,6 @@ from adaptfault.inspection.code import Need
 from adaptfault.inspection.data_set import DataSetCheck
 from adaptfault.inspection.findings import Unchecked
 from adaptfault.inspection.result import Inspection, faults_and_frames, finding_of
-from adaptfault.inspection.severity import UNTESTED
 from diagnostics import Diagnosis, SensorLayout, TransportFault
 from diagnostics.decision.by_recording import with_recordings
 from diagnostics.preprocessing.load import LoadDirection
@@ -120,11 +120,12 @@ def quick(statistics: Statistics) -> Quick:
     answers = together.answers(spans)[place] & present
     moves = np.asarray(together.moves(spans).any(axis=0))[place] & present
     findings = faults_and_frames(diagnosis)
-    known = answers | diagnosis.fault_set.mask & present
-    if known.sum() < UNTESTED * present.sum():
+    left = int((present & ~diagnosis.fault_set.mask).sum())
+    if left:
         text = (
-            f"only {known.sum()} of {present.sum()} cells answer together with those beside them,"
-            " so faults may be hidden: run the whole check, without --quick"
+            f"{left} of {int(present.sum())} cells were not tested, so faults may be hidden:"
+            f" {int((answers & ~diagnosis.fault_set.mask).sum())} of them answer together with"
+            " those beside them, which proves none alive; run the whole check, without --quick"
         )
         findings.append(finding_of("untested", text))
     readings = ChangedReadings(None, None, [], diagnosis)
@@ -171,6 +172,7 @@ def quick_check(
         naming,
         "quick",
         left,
+        stood_still=statistics.stands_still.told(naming.recordings),
     )
 
 

@@ -29,6 +29,7 @@ from adaptfault.data.summary import Summary
 from adaptfault.inspection.begins import Begins, Begun
 from adaptfault.inspection.groupings import Groupings, joined
 from adaptfault.inspection.naming import Naming, classes_of
+from adaptfault.inspection.stands_still import Longest, StandsStill
 from diagnostics import SensorLayout
 from diagnostics.preprocessing.quantiles import known_quantile
 from diagnostics.preprocessing.readings import RecordingBlocks
@@ -36,7 +37,7 @@ from diagnostics.sensor.repeated_frames import Repetitions
 from diagnostics.when import Spans
 from diagnostics.when.together import Together
 
-SCHEMA = "adaptfault.quick/2"
+SCHEMA = "adaptfault.quick/3"
 
 _KEPT = 5  # frames of each recording, evenly spread
 
@@ -52,6 +53,7 @@ class Statistics:
         spans: ranges of the readings.
         together: sums.
         begins: how they begin.
+        stands_still: where one frame came many times.
         sample: float32 ``[n, 5, D]``, frames of each.
         missing: int ``[D]``, readings.
         repetitions: of frames.
@@ -65,6 +67,7 @@ class Statistics:
     spans: Spans
     together: Together
     begins: Begins
+    stands_still: StandsStill
     sample: NDArray[np.float32]
     missing: NDArray[np.int64]
     repetitions: Repetitions
@@ -82,6 +85,7 @@ class Statistics:
         pieces = []
         repetitions = []
         begun: list[Begun] = []
+        longest: list[Longest] = []
         sample = np.full((len(naming.lengths), _KEPT, layout.n_cells), np.nan, np.float32)
         missing = np.zeros(layout.n_cells, np.int64)
         for number, first, frames in _pieces(log, naming.lengths):
@@ -92,7 +96,9 @@ class Statistics:
             repetitions.append(Repetitions.of(frames[:, present]))
             if not first:
                 begun.append(Begun(layout))
+                longest.append(Longest(layout))
             begun[-1].add(frames)
+            longest[-1].add(frames)
             missing += np.isnan(valid.given[0]).sum(axis=0)
             kept = np.linspace(0, naming.lengths[number] - 1, _KEPT).astype(int) - first
             here = (kept >= 0) & (kept < len(frames))
@@ -105,6 +111,7 @@ class Statistics:
             Spans.joined(spans).whole(pieces, naming.lengths),
             Together.joined(together).whole(pieces, naming.lengths),
             Begins.joined([one.begins() for one in begun]),
+            StandsStill.joined([one.run() for one in longest]),
             sample,
             missing,
             Repetitions.joined(repetitions),
@@ -138,6 +145,7 @@ class Statistics:
             Spans.joined([part.spans for part in parts]),
             Together.joined([part.together for part in parts]),
             Begins.joined([part.begins for part in parts]),
+            StandsStill.joined([part.stands_still for part in parts]),
             np.concatenate([part.sample for part in parts]),
             np.sum([part.missing for part in parts], axis=0),
             Repetitions.joined([part.repetitions for part in parts]),
@@ -170,6 +178,10 @@ class Statistics:
         Raises:
             OSError: it cannot be written.
         """
+        atomic_write(path, self.to_bytes())
+
+    def to_bytes(self) -> bytes:
+        """Return the content of the file."""
         about = {
             "schema": SCHEMA,
             "layout": self.layout.to_dict(),
@@ -192,9 +204,10 @@ class Statistics:
             sample=self.sample,
             missing=self.missing,
             between=self.repetitions.between,
+            still=np.stack([self.stands_still.lengths, self.stands_still.begins]),
             **{f"begins_{name}": values for name, values in vars(self.begins).items()},
         )
-        atomic_write(path, stored.getvalue())
+        return stored.getvalue()
 
     @classmethod
     def load(cls, path: str | PathLike[str]) -> Statistics:
@@ -219,6 +232,7 @@ class Statistics:
                     Spans(held["low"], held["high"]),
                     Together(held["sums"]),
                     Begins(*(held[f"begins_{field.name}"] for field in fields(Begins))),
+                    StandsStill(*held["still"]),
                     held["sample"],
                     held["missing"],
                     counted,

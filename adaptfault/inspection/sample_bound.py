@@ -2,18 +2,80 @@
 
 Of N recordings, K hold a fault that the check finds in them. In n drawn without replacement the
 number X of such recordings is hypergeometric. The bound is the largest K with P(X <= k) of at least
-5 % at the k that were found (Clopper and Pearson 1934, for finite sets).
+5 % at the k that were found (Clopper and Pearson 1934, for finite sets). It is told of faults of
+one cell or more, and of those of a tenth of the cells or more, which need a person.
 
 Not bounded: what the check does not find in a recording that holds it.
 """
 
 from __future__ import annotations
 
+import math
+from dataclasses import asdict, dataclass
 from math import comb
+from typing import Any
 
 from diagnostics import Diagnosis, Verdict
 
 _RISK = 0.05
+_MANY = 0.1  # of the cells: a person is needed
+
+
+@dataclass(frozen=True)
+class Bound:
+    """How many recordings hold a fault at most.
+
+    Attributes:
+        cells: of the fault, or more.
+        found: drawn recordings in which such a fault shows.
+        most: of all recordings.
+    """
+
+    cells: int
+    found: int
+    most: int
+
+
+@dataclass(frozen=True)
+class SampleBound:
+    """What recordings that were drawn tell of all.
+
+    Attributes:
+        drawn: number of recordings that were drawn.
+        of: number of all.
+        confidence: of the bounds, each by itself.
+        bounds: for faults of some cells or more.
+    """
+
+    drawn: int
+    of: int
+    confidence: float
+    bounds: tuple[Bound, ...]
+
+    @classmethod
+    def from_diagnosis(cls, diagnosis: Diagnosis, of: int) -> SampleBound:
+        """Return what a diagnosis of recordings tells that were drawn at random from ``of``."""
+        faulty = (diagnosis.by_recording.verdicts == Verdict.FAULTY).sum(axis=1)
+        drawn = diagnosis.n_recordings
+        many = max(2, math.ceil(_MANY * int(diagnosis.layout.present.sum())))
+        bounds = []
+        for cells in (1, many):
+            found = int((faulty >= cells).sum())
+            bounds.append(Bound(cells, found, most_faulty(found, drawn, of)))
+        return cls(drawn, of, 1 - _RISK, tuple(bounds))
+
+    def __str__(self) -> str:
+        one, many = self.bounds
+        return (
+            f"a fault shows in {one.found} of {self.drawn} recordings drawn from {self.of}: with"
+            f" {self.confidence:.0%} confidence in at most {one.most} of all"
+            f" ({one.most / self.of:.1%}), and one of {many.cells} cells or more in at most"
+            f" {many.most} ({many.most / self.of:.1%}), as far as a quick check finds it"
+        )
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return a JSON-safe dict."""
+        return {**asdict(self), "bounds": [asdict(one) for one in self.bounds]}
 
 
 def most_faulty(found: int, drawn: int, of: int, risk: float = _RISK) -> int:
@@ -39,23 +101,6 @@ def most_faulty(found: int, drawn: int, of: int, risk: float = _RISK) -> int:
         else:
             most = middle - 1
     return least
-
-
-def bound_of_sample(diagnosis: Diagnosis, of: int) -> str:
-    """Return in how many of all recordings a fault shows at most, in one sentence.
-
-    Args:
-        diagnosis: of recordings that were drawn at random.
-        of: number of all recordings.
-    """
-    faulty = diagnosis.by_recording.verdicts == Verdict.FAULTY
-    found = int(faulty.any(axis=1).sum())
-    drawn = diagnosis.n_recordings
-    most = most_faulty(found, drawn, of)
-    return (
-        f"a fault shows in {found} of {drawn} recordings drawn from {of}: with {1 - _RISK:.0%}"
-        f" confidence in at most {most} of all ({most / of:.1%}), as far as a quick check finds it"
-    )
 
 
 def _at_most(found: int, drawn: int, faulty: int, of: int) -> float:

@@ -8,13 +8,14 @@ from itertools import pairwise
 
 import jsonschema
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import hypergeom
 
 from adaptfault.cli import main
-from adaptfault.data.recordings import Recordings, save_npz
+from adaptfault.data.recordings import Recordings, load, save_npz
 from adaptfault.data.recordings.facts.rates import Clock
 from adaptfault.data.simulated_grasps import simulate
 from adaptfault.inspection.quick import quick, quick_check
@@ -59,11 +60,14 @@ def test_what_holds_a_value_in_some_recordings_is_found_and_nothing_is_called_al
         assert set(diagnosis.faults[0].recordings or ()) <= set(range(len(log))[where])
 
 
-def test_of_a_healthy_set_nothing_is_told_but_what_was_not_checked(grasps):
+def test_of_a_healthy_set_nothing_is_told_but_that_it_was_not_tested(grasps):
     log = Recordings(tuple(grasps), LAYOUT)
     statistics = Statistics.of(log)
     found = quick(statistics)
-    assert (found.inspection.findings, found.answers.mean() > 0.8) == ((), True)
+    (told,) = found.inspection.findings
+    assert (told.name, told.severity) == ("untested", 1)
+    assert f"{LAYOUT.n_cells} of {LAYOUT.n_cells} cells were not tested" in told.reason
+    assert found.answers.mean() > 0.8
     checked = quick_check(statistics, found, Clock())
     assert checked.to_dict()["level"] == "quick"
     assert "was not tested" in checked.findings.unchecked[0].what
@@ -114,13 +118,44 @@ def test_the_correlation_is_that_with_the_mean_of_the_cells_beside(grasps):
     np.testing.assert_allclose(together.correlation[1, MIDDLE], expected, rtol=1e-9)
 
 
+@pytest.mark.parametrize(
+    ("options", "code"),
+    [((), 1), (("--fail-on", "never"), 1), (("--untested-code", "0"), 0)],
+)
+def test_what_was_not_tested_is_no_pass_unless_that_is_declared_harmless(
+    options, code, grasps, tmp_path, capsys
+):
+    save_npz(tmp_path / "set.npz", Recordings(tuple(grasps), LAYOUT))
+    assert main(["check", str(tmp_path / "set.npz"), "--quick", *options]) == code
+    assert "TOUCH-190" in capsys.readouterr().out
+
+
+def test_the_table_has_the_verdict_of_each_cell_in_each_recording(stored, tmp_path):
+    table = tmp_path / "verdicts.parquet"
+    assert main(["check", str(stored), "--quick", "--table", str(table)]) == 1
+    read = pq.read_table(table).to_pylist()
+    document = Statistics.of(load(stored).recordings)
+    found = quick(document).inspection.diagnosis
+    assert len(read) == found.n_recordings * LAYOUT.n_cells
+    verdicts = np.array([one["verdict"] for one in read]).reshape(found.n_recordings, -1)
+    assert (verdicts == found.by_recording.verdicts.astype(str)).all()
+    shown = [one for one in read if one["code"]]
+    assert {(one["code"], one["cell"], one["verdict"]) for one in shown} == {
+        ("TOUCH-103", MIDDLE, "FAULTY")
+    }
+    faulty = {read[i * LAYOUT.n_cells]["recording"] for i in found.faults[0].recordings}
+    assert {one["recording"] for one in shown} == faulty
+    first = read[MIDDLE]
+    assert (first["pad"], first["row"], first["column"], first["class"]) == ("0", 3, 3, "pick")
+
+
 def test_the_command_says_its_level_and_waits_for_no_package_that_it_does_not_need(
     grasps, tmp_path
 ):
     save_npz(tmp_path / "set.npz", Recordings(tuple(grasps), LAYOUT))
     code = (
         "import sys; from adaptfault.cli import main; code = main(sys.argv[1:]);"
-        "assert code == 0, code;"
+        "assert code == 1, code;"
         "sys.exit(str({'pandas', 'scipy', 'sklearn', 'torch', 'tqdm'} & sys.modules.keys()))"
     )
     arguments = ["check", str(tmp_path / "set.npz"), "--quick"]
@@ -236,8 +271,12 @@ def test_what_is_no_part_or_of_another_array_is_refused(stored, tmp_path, capsys
     other = str(tmp_path / "other.npz")
     assert main(["check", str(stored), "--full-scale", "5", "--shard", "1/2", "--out", other]) == 0
     capsys.readouterr()
-    assert main(["check", "--merge", str(stored), part]) == 3
+    assert main(["check", "--merge", str(stored)]) == 3
     assert "is no part of a check" in capsys.readouterr().err
+    assert main(["check", "--merge", str(stored), part]) == 1  # the rest goes on
+    captured = capsys.readouterr()
+    assert "is no part of a check" in captured.err
+    assert "TOUCH-191" in captured.out
     assert main(["check", "--merge", part, other]) == 3
     assert "not of one array" in capsys.readouterr().err
     for arguments in (["--shard", "3/2", "--out", other], ["--shard", "1/2"], ["--sample", "0"]):
@@ -245,10 +284,30 @@ def test_what_is_no_part_or_of_another_array_is_refused(stored, tmp_path, capsys
         assert "--shard" in (told := capsys.readouterr().err) or "--sample" in told
 
 
-def test_a_sample_says_how_many_recordings_hold_a_fault_at_most(stored, capsys):
-    assert main(["check", str(stored), "--sample", "20"]) in (0, 1)
+def test_a_sample_says_how_many_recordings_hold_a_fault_at_most(stored, tmp_path, capsys):
+    out = tmp_path / "sample.json"
+    assert main(["check", str(stored), "--sample", "20", "--out", str(out)]) == 1
     told = capsys.readouterr().out
     assert re.search(r"in \d+ of 20 recordings drawn from \d+: with 95% confidence", told)
+    document = json.loads(out.read_text())
+    jsonschema.validate(document, schema_of(document["schema"]))
+    one, many = document["sample"]["bounds"]
+    assert (one["cells"], many["cells"]) == (1, 4)  # a tenth of 36
+    assert many["found"] == 0
+    drawn, of = document["sample"]["drawn"], document["sample"]["of"]
+    assert one["most"] == most_faulty(one["found"], drawn, of)
+    assert many["most"] == most_faulty(0, drawn, of)
+
+
+@settings(max_examples=20, deadline=None)
+@given(faulty=st.integers(0, 40), drawn=st.integers(1, 40), seed=st.integers(0, 1000))
+def test_the_bound_of_a_sample_holds_for_the_whole(faulty, drawn, seed):
+    """Over many draws of one set, the bound is below the truth in at most one of twenty."""
+    rng = np.random.default_rng(seed)
+    holds = np.arange(40) < faulty
+    found = [int(rng.permutation(holds)[:drawn].sum()) for _ in range(300)]
+    missed = np.mean([most_faulty(k, drawn, 40) < faulty for k in found])
+    assert missed <= 0.05 + 4 * np.sqrt(0.05 * 0.95 / 300)
 
 
 @given(of=st.integers(1, 60), data=st.data())

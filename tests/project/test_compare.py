@@ -186,3 +186,26 @@ def test_the_network_in_keras_is_the_network(examples, monkeypatch: pytest.Monke
     from adaptfault.models.network import logits_of
 
     np.testing.assert_allclose(theirs.predict(x, verbose=0), logits_of(ours, x).numpy(), atol=1e-5)
+
+
+def test_what_linters_say_of_cells_is_read_from_what_they_print(examples, tmp_path):
+    from compare.linters import KINDS, Tool, cells_named, grasps, others, ours, write
+
+    told = (
+        "8 dimension(s) never change: observation.tactile.left[0],\nobservation.tactile.right[79]"
+    )
+    boxed = (
+        "observation.tactile.right: 2 constant dimension(s) across ALL │\n│ episodes: dim 0 (=0.0),"
+        " dim 7 (=0.0) - x"
+    )
+    assert cells_named(Tool("other", ()), told, tmp_path) == {0, 159}
+    assert cells_named(Tool("other", ()), boxed, tmp_path) == {80, 87}
+    frames, tasks = grasps(3)
+    assert [len(break_cells(frames, tasks)) for break_cells in KINDS.values()] == [0, 12, 6]
+    write(tmp_path / "set", frames, tasks)
+    read = af.load(tmp_path / "set", shape=(2, 10, 8), full_scale=3.3).recordings
+    np.testing.assert_array_equal(np.concatenate(read.frames), np.concatenate(frames))
+    assert [read.class_names[label] for label in read.labels[:4]] != ["nothing"] * 4
+    (tmp_path / "bin").mkdir()
+    (tmp_path / "bin/rda").touch()
+    assert len({*others(tmp_path), *ours()}) == 6

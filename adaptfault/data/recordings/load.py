@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from adaptfault.data.addresses import is_address
 from adaptfault.data.recordings.check import (
     OutOfRange,
     check_readings,
@@ -45,6 +46,7 @@ from adaptfault.data.recordings.facts.targets import TargetTable, target_files
 from adaptfault.data.recordings.files import Found, find, passed_over
 from adaptfault.data.recordings.readers import check_stated, readers
 from adaptfault.data.recordings.recording import BLOCK, Recording, Shape
+from adaptfault.data.recordings.remote import fetched
 from adaptfault.data.recordings.survey import Content, Surveyor
 from diagnostics import SensorLayout
 from diagnostics.shown import shown
@@ -244,8 +246,9 @@ def load(paths: PathName | Iterable[PathName], *, strict: bool = False, **option
     no labels.
 
     Args:
-        paths: a file, a folder, or several of them. Folders are searched to the bottom, in natural
-            order.
+        paths: a file, a folder, or several of them; addresses, as ``hf://datasets/me/touch``
+            (:mod:`adaptfault.data.recordings.remote`); or a data set of LeRobot. Folders are
+            searched to the bottom, in natural order.
         layout: the array; a layout file; a shape ``(2, 13, 6)``, "2x13x6" or, for one pad, "13x6".
             None: from the files, see Notes.
         shape: a shape alone, in the same forms, in place of ``layout``.
@@ -278,7 +281,7 @@ def load(paths: PathName | Iterable[PathName], *, strict: bool = False, **option
         largest reading. The rate is the file's, or that of its times, or 10 Hz. Every inferred fact
         is in ``inferred``.
     """
-    given = [paths] if isinstance(paths, str | PathLike) else list(paths)
+    given = _all(paths)
     opened = open_recordings(given, strict=strict, room=None, **options)
     recordings = Recordings(
         tuple(opened),
@@ -326,7 +329,8 @@ def open_recordings(
     Raises:
         InputError: as :func:`load`.
     """
-    given = [Path(paths)] if isinstance(paths, str | PathLike) else [Path(path) for path in paths]
+    before: list[Problem] = []
+    given = [_place(path, stated, before) for path in _all(paths)]
     if layout is not None and shape is not None:
         raise InputError("layout and shape both given: one of them is enough")
     _check_options(given, frames, labels, targets)
@@ -337,6 +341,7 @@ def open_recordings(
     tables_given = (layout, labels, calibration, targets)
     aside = {Path(p).resolve() for p in tables_given if isinstance(p, str | PathLike)}
     found, problems = find(given, readers(), aside)
+    problems[:0] = before
     surveyor = Surveyor(PAPER.full_scale * SLACK, 2**62 if room is None else room, progress)
     listed: Iterable[Listed] = _listed(found, _asked(stated, array), problems)
     unread: list[Found] = []
@@ -369,6 +374,36 @@ def open_recordings(
     usable = _usable(contents, known, check, frames, problems)
     scan = surveyor.scans.of(known, problems)
     return Opened(usable, known, inferred, tables, problems, values, n_found, scan)
+
+
+def local_paths(
+    paths: PathName | Iterable[PathName] | Any, stated: Mapping[str, Any]
+) -> list[Path]:
+    """Return where paths are read: addresses as their copies on this machine.
+
+    Args:
+        paths, stated: as for :func:`load`.
+    """
+    return [_place(path, stated, []) for path in _all(paths)]
+
+
+def _all(paths: PathName | Iterable[PathName] | Any) -> list[PathName]:
+    """Return the paths that are given; that of a data set which says where it lies, as LeRobot's,
+    is its ``root``."""
+    root = getattr(paths, "root", None)
+    if isinstance(root, str | PathLike) and not isinstance(paths, str | PathLike):
+        return [root]
+    return [paths] if isinstance(paths, str | PathLike) else list(paths)
+
+
+def _place(path: PathName, stated: Mapping[str, Any], problems: list[Problem]) -> Path:
+    """Return where to read a path: itself, or the copy of what is at an address."""
+    if not is_address(path):
+        return Path(path)
+    key = stated.get("key")
+    if not isinstance(key, str | None):
+        key = ",".join(key)
+    return fetched(str(path), readers(), key, problems)
 
 
 def _check_options(

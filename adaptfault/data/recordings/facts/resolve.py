@@ -82,6 +82,7 @@ def resolve_layout(
         shape, reason = (array, "") if array else infer_shape(contents)
         if reason:
             inferred.append(f"shape {'x'.join(map(str, shape))} ({reason}); otherwise give --shape")
+        shape = _with_axes(contents, shape)
         problems += _without_rows(contents, shape)
         stated = _of_files(contents, shape, options)
         stated["device"] = _device(contents, problems)
@@ -179,16 +180,26 @@ def _of_readers(contents: Sequence[Content]) -> list[str]:
     return found
 
 
+def _with_axes(contents: Sequence[Content], shape: Shape) -> Shape:
+    """Return a shape with the axes of each position, where it counts positions alone."""
+    axes = _first(content.facts.declared.get("axes") for content in contents) or 1
+    pads, rows, cols = shape
+    if all(content.width == axes * math.prod(shape) for content in contents):
+        return pads, rows, cols * axes
+    return shape
+
+
 def _without_rows(contents: Sequence[Content], shape: Shape) -> list[Problem]:
     """Warn where pads are told by names alone, so that their rows and columns are unknown."""
     told = [c for c in contents if c.shape == shape and c.facts.shape_reason]
     if not told or shape[1] > 1 or shape[2] == 1:
         return []
     pads, _, cells = shape
+    cells //= told[0].facts.declared.get("axes", 1)
     what = (
         f"{told[0].facts.shape_reason}, and nothing states their rows and columns: taken as {pads}"
-        f" pads without rows, so that a broken row or column shows as single cells; give --shape"
-        f" {pads}x{sides(cells)}, or {pads}x1x{cells} if they have none"
+        f" pad{'s' * (pads > 1)} without rows, so that a broken row or column shows as single"
+        f" cells; give --shape {pads}x{sides(cells)}, or {pads}x1x{cells} if they have none"
     )
     return [Problem.warning(told[0].path, what)]
 

@@ -17,7 +17,7 @@ EPISODES = ("episode_index", "episode", "episode_id", "recording", "trial")
 LABELS = ("label", "labels", "class", "object", "task")
 """Names of classes, in the order of preference."""
 
-TOUCH = re.compile(r"tactile|taxel|pressure|touch|skin|fsr", re.IGNORECASE)
+TOUCH = re.compile(r"tactile|taxel|pressure|touch|skin|fsr|electrode", re.IGNORECASE)
 """A word for touch in the name of readings."""
 
 _UNITS = {
@@ -62,6 +62,20 @@ COUNTERS = ("frame_index", "frame_id", "sample_index", "task_index")
 
 _STATUS = re.compile(r"(?:.*_)?(?:flags?|status|state|valid|checksum|crc(?:8|16|32)?)", re.I)
 """Names of what accompanies readings."""
+
+_SUMMARY = re.compile(
+    r"(?:.*[_ .])?(?:peak|max|maximum|mean|avg|average|median|std|rms)(?:[_ .]?\d*|[_ .].*)",
+    re.IGNORECASE,
+)
+"""Names of values of a whole grasp."""
+
+_OF_PADS = re.compile(
+    r"(?:.*[_ .])?(?:f|finger|fingertip|tip|pad|hand|foot|module|patch)[_ ]?\*.*\*.*",
+    re.IGNORECASE,
+)
+"""Names, with stars for their numbers, of which the first counts pads."""
+
+_AXIS = re.compile(r"(.*\d.*?)[_ .]?([xyz])", re.IGNORECASE)
 
 _SHOWN = 12  # columns in a message
 _DIGITS = re.compile(r"\d+")
@@ -232,11 +246,57 @@ def shape_of(names: Sequence[str]) -> tuple[Shape, str] | None:
     grid = grids.pop()
     if not grids and grid is not None and (len(stems) == 1 or grid[0] == 1):
         shown = f"names {names[0]} to {names[-1]}"
+        if grid[0] == 1 and len(stems) == 1 and _OF_PADS.fullmatch(stems[0]):
+            grid = grid[1], 1, grid[2]
         return (len(stems) * grid[0], grid[1], grid[2]), shown
     if len(stems) == 1:
         return None
     shown = f"{', '.join(stems)}: {len(stems)} times {len(columns) // len(stems)} columns"
     return (len(stems), 1, sizes.pop()), shown
+
+
+def is_summary(name: str) -> bool:
+    """Return whether a name is that of a value of a whole grasp, as ``peak_3`` or ``c2_mean``."""
+    return _SUMMARY.fullmatch(name) is not None
+
+
+def sizes_of(names: Sequence[str]) -> tuple[list[tuple[int, ...]], str] | None:
+    """Return the sizes of pads that differ, as the names of their readings show them, and how:
+    families that stand one behind the other, each of rows and columns or of a row.
+
+    None where they show none.
+    """
+    found = families(names)
+    columns = [column for family in found.values() for column in family]
+    if len(found) < 2 or columns != list(range(len(names))):
+        return None
+    sizes: list[tuple[int, ...]] = []
+    for family in found.values():
+        grid = _grid([names[i] for i in family])
+        sizes.append((len(family),) if grid is None else grid if grid[0] > 1 else grid[1:])
+    told = ", ".join(
+        f"{stem} {' x '.join(map(str, size))}" for stem, size in zip(found, sizes, strict=True)
+    )
+    return sizes, told
+
+
+def axes_of(names: Sequence[str]) -> tuple[int, list[int]]:
+    """Return how many axes each position has, and the columns in the order of positions and axes:
+    names as ``taxel_12_x``. One axis, where they show none."""
+    every = list(range(len(names)))
+    parts = [_AXIS.fullmatch(name) for name in names]
+    if not names or any(part is None for part in parts):
+        return 1, every
+    of: dict[str, dict[str, int]] = {}
+    for column, part in enumerate(parts):
+        assert part is not None
+        of.setdefault(part[1], {})[part[2].lower()] = column
+    axes = [sorted(one) for one in of.values()]
+    if len(axes) < 2 or len(axes[0]) < 2 or any(one != axes[0] for one in axes):
+        return 1, every
+    if len(names) != len(axes) * len(axes[0]):
+        return 1, every
+    return len(axes[0]), [one[axis] for one in of.values() for axis in axes[0]]
 
 
 def _numbers(name: str) -> tuple[int, ...]:

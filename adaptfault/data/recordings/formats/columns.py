@@ -8,6 +8,7 @@ import re
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
+from itertools import accumulate, pairwise
 from pathlib import Path
 
 import numpy as np
@@ -19,17 +20,21 @@ from adaptfault.data.recordings.facts.roles import (
     EPISODES,
     LABELS,
     SCAN,
+    axes_of,
     clock_of,
     first_of,
     in_order,
     is_clock,
+    is_summary,
     left_out,
     no_readings,
     reordered,
     shape_of,
+    sizes_of,
     unit_of,
 )
 from adaptfault.data.recordings.facts.roles import readings as readings_of
+from adaptfault.data.recordings.formats.datasets.features import Pads
 from adaptfault.data.recordings.formats.dialect import (
     Dialect,
     bare,
@@ -76,6 +81,8 @@ class Columns:
         inferred: what was chosen by names, with the option that states it.
         has_text: whether columns that are not used hold text or dates.
         problems: warnings.
+        pads: of different sizes, as the names show them; None: all have the same.
+        axes: readings of one position, as the names show them; they stand together.
     """
 
     width: int
@@ -91,6 +98,15 @@ class Columns:
     inferred: tuple[str, ...] = ()
     has_text: bool = False
     problems: tuple[Problem, ...] = ()
+    pads: Pads | None = None
+    axes: int = 1
+
+    @property
+    def parts(self) -> list[slice]:
+        """The readings of each pad, where pads differ in size."""
+        sizes = () if self.pads is None else self.pads.sizes
+        ends = list(accumulate(map(math.prod, sizes), initial=0))
+        return [slice(*pair) for pair in pairwise(ends)]
 
     @property
     def used(self) -> list[int]:
@@ -147,7 +163,26 @@ def choose_columns(
             path, f"holds {held} and no readings; add one column a cell", table.first_line
         )
     names = tuple(table.names[i] for i in readings) if table.names else ()
-    shown = shape_of(names) if shape is None and names else None
+    if names and columns is None:
+        _refuse_summaries(path, names)
+    axes, order = axes_of(names)
+    if shape is not None and math.prod(shape) == len(names) // axes:
+        shape = shape[0], shape[1], shape[2] * axes
+    if axes > 1:
+        readings = [readings[i] for i in order]
+        names = tuple(names[i] for i in order)
+    shown = None
+    pads = None
+    if axes > 1:
+        what = f"{len(names) // axes} positions of {axes} axes, {names[0]} to {names[-1]}"
+        shown = shape or (1, 1, len(names)), what
+    elif shape is None and names:
+        shown = shape_of(names)
+        unequal = sizes_of(names) if shown is None else None
+        if unequal is not None:
+            pads = Pads.of(unequal[0])
+            assert pads.shape is not None
+            shown = pads.shape, unequal[1]
     others = set(range(dialect.width)) - {*readings, roles.clock, roles.scan}
     return replace(
         roles,
@@ -158,7 +193,23 @@ def choose_columns(
         inferred=inferred,
         has_text=table.has_unreadable(others),
         problems=problems,
+        pads=pads,
+        axes=axes,
     )
+
+
+def _refuse_summaries(path: Path, names: Sequence[str]) -> None:
+    """Raise InputError where most readings are named as values of a whole grasp or step, a row
+    each."""
+    found = [name for name in names if is_summary(name)]
+    if 2 * len(found) <= len(names):
+        return
+    what = (
+        f"{found[0]} to {found[-1]} are values of a whole grasp or step, as their names say, and a"
+        " row is one of them: no frames, so nothing tells how a cell moves; give the recordings"
+        " themselves, or name frames with --columns"
+    )
+    raise InputError.at(path, what)
 
 
 def _by_names(

@@ -29,6 +29,7 @@ import numpy as np
 
 from adaptfault.data.recordings.errors import InputError, Problem
 from adaptfault.data.recordings.facts.sizes import LONGEST_LINE
+from adaptfault.data.recordings.formats import listed
 from adaptfault.data.recordings.formats.columns import Columns, Names, choose_columns
 from adaptfault.data.recordings.formats.dialect import (
     CLOCK,
@@ -92,6 +93,9 @@ def open(
             lines of different lengths, or a cell that is no number.
     """
     check_text(path)
+    if columns is None and listed.accepts(path):
+        places = {"time_column": time_column, "label_column": label_column}
+        return listed.open(path, shape=shape, **places, **stated)
     try:
         dialect = find_dialect(path)
     except OSError as error:
@@ -103,15 +107,20 @@ def open(
     if dialect.rows:
         return matrices(path, dialect)
     held = choose_columns(path, dialect, columns, ignore, time_column, label_column, shape)
+    pads = held.pads
     spans, division = spans_of(path, dialect, held)
     lost = (Problem.warning(path, division.lost),) if division.lost else ()
     facts = Facts(
         path,
         text=True,
         shape=held.shape,
+        present=None if pads is None else pads.present,
+        declared={} if held.axes == 1 else {"axes": held.axes},
         inferred=tuple(filter(None, (*held.inferred, division.inferred))),
         shape_reason=held.shape_reason,
-        names=held.names,
+        names=held.names if pads is None else (),
+        sizes=() if pads is None else pads.sizes,
+        places=None if pads is None else pads.places,
         problems=(*held.problems, *lost),
     )
 
@@ -232,6 +241,8 @@ def _parse(path: Path, data: bytes, before: _Before, dialect: Dialect, columns: 
     # a reading that float32 cannot hold becomes infinite, and is missing
     with np.errstate(all="ignore"):
         readings = values.astype(np.float32, copy=False)
+    if columns.pads is not None:
+        readings = columns.pads.frames([readings[:, part] for part in columns.parts])
     return Block(readings, lines, times, unit, problems, scan)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -31,9 +31,18 @@ _SAMPLE = 1_000_000  # of them, where there are more rows
 _FRAMES = 10  # fewer do not show how readings change
 
 
-def is_time_last(path: Path, arrays: Mapping[str, Array], shape: Shape | None) -> bool:
+def is_time_last(
+    path: Path, arrays: Mapping[str, Array], shape: Shape | None, times: Sequence[int] = ()
+) -> bool:
     """Return whether the last axis of arrays, one a pad, is the time, as MATLAB programs store it:
-    only all axes before it together hold the cells of the ``shape`` that the user states.
+    only all axes before it together hold the cells of the ``shape`` that the user states, or there
+    is a time for each place of the last axis and for none of the first.
+
+    Args:
+        path: of the file, for messages.
+        arrays: of the readings.
+        shape: ``(pads, rows, cols)`` where the user states it.
+        times: how many times each array of times beside them holds.
 
     Raises:
         InputError: no shape is stated, and the last axis looks like the time.
@@ -42,6 +51,8 @@ def is_time_last(path: Path, arrays: Mapping[str, Array], shape: Shape | None) -
     if any(len(one) < 2 for one in sizes):
         return False
     if shape is None:
+        if times and all(one[-1] in times and one[0] not in times for one in sizes):
+            return True
         if all(map(is_smoothest_along_last, arrays.values())):
             raise InputError.at(path, _doubt(arrays))
         return False

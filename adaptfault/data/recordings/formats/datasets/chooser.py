@@ -153,7 +153,8 @@ class Chooser:
             self.is_doubted = is_smoothest_along_last(arrays[first[0]])
         elif not self.contents.is_table and self.known is None:
             chosen_arrays = {name: arrays[name] for name in first}
-            self.is_turned = is_time_last(self.path, chosen_arrays, self.shape)
+            times = self._times(first[0])
+            self.is_turned = is_time_last(self.path, chosen_arrays, self.shape, times)
         self.outer = not self.is_turned and self._holds_recordings(first)
         return found
 
@@ -465,6 +466,12 @@ class Chooser:
         groups = name.split("/")[:-1]
         above = ["/".join(groups[:depth]) for depth in range(len(groups), 0, -1)]
         return list(dict.fromkeys([*above, *_BESIDE]))
+
+    def _times(self, name: str) -> list[int]:
+        """Return how many values the arrays of times near an array hold, each one a vector."""
+        near = [one for group in self._groups(name) for one in self._beside.get(group, [])]
+        found = [self.contents.arrays[one].shape for one in near if is_clock(last_part(one))]
+        return [max(sizes) for sizes in found if sizes and math.prod(sizes) == max(sizes) > 1]
 
     def _clock(self, name: str, length: int) -> str | None:
         stated = self.stated.clock

@@ -76,7 +76,7 @@ def choose(path: Path, features: Mapping[str, Sizes], key: str | None = None) ->
     cells = [name for name in features if not _NO_TOUCH.search(name)]
     if cells and not arrays:  # each is a cell
         return [cells[i] for i in readings(cells)]
-    what = "no feature has touch, tactile, taxel, pressure, skin or fsr in its name"
+    what = "no feature has touch, tactile, taxel, pressure, skin, fsr or electrode in its name"
     raise InputError.at(path, f"{what}; {_held(features)}; name one with --key")
 
 

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from adaptfault.data.recordings.errors import InputError, foreseeing
+from adaptfault.data.recordings.facts.roles import is_clock
 from adaptfault.data.recordings.facts.sizes import MOST_BYTES
 from adaptfault.data.recordings.formats.datasets import hdf5
 from adaptfault.data.recordings.formats.datasets.contents import Contents, element, kept
@@ -23,6 +24,7 @@ _HDF5 = b"\x89HDF"
 _HEADER = 512  # bytes that MATLAB writes before the HDF5 file
 _HEAD = 128  # bytes before the first element of version 5
 _COMPRESSED = 15  # type of an element
+_FRAMES = 10  # structures, that they may be frames
 _PIECE = 1 << 20  # bytes that are unpacked at once, to count them
 
 
@@ -84,10 +86,25 @@ def _unpacked(data: bytes) -> int:
     return total
 
 
+def _are_frames(array: Any) -> bool:
+    """Return whether an array of structures has one frame each: a field of times holds one number
+    in each."""
+    if array.size < _FRAMES:
+        return False
+    clocks = [field for field in array.dtype.names if is_clock(field)]
+    return any(all(np.size(one) == 1 for one in array[field].ravel()) for field in clocks)
+
+
 def _add(contents: Contents, name: str, value: Any) -> None:
     """Take in a variable: fields of structures and elements of cell arrays one by one."""
     array = np.asarray(value)
-    if array.dtype.names:
+    if array.dtype.names and _are_frames(array):
+        for field in array.dtype.names:
+            held = [np.asarray(one) for one in array[field].ravel()]
+            if len({one.shape for one in held}) == 1 and held[0].dtype.kind in "biuf":
+                stacked = np.stack(held)
+                contents.add(f"{name}/{field}", stacked.squeeze() if held[0].size == 1 else stacked)
+    elif array.dtype.names:
         for field in array.dtype.names:
             for place, one in enumerate(array[field].ravel()):
                 number = "" if array.size == 1 else f"/{place}"

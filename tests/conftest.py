@@ -354,12 +354,6 @@ def _fit_of(steps: int, logs: int) -> Iterator[None]:
         yield
 
 
-def rough_fit() -> AbstractContextManager[None]:
-    """Let a fit take fewer steps and judge fewer logs, which take most of its time, where accuracy
-    is not what is proven."""
-    return _fit_of(200, 8)
-
-
 def whole_fit() -> AbstractContextManager[None]:
     """Let a fit take all its steps and judge all its logs, where its accuracy is what is proven."""
     return _fit_of(_STEPS, _LOGS)
@@ -367,14 +361,9 @@ def whole_fit() -> AbstractContextManager[None]:
 
 @pytest.fixture(scope="session", autouse=True)
 def rough_fits() -> Iterator[None]:
-    """Let fits be rough; see ``wholly_fitted``."""
-    with rough_fit():
-        yield
-
-
-@pytest.fixture
-def roughly_fitted() -> Iterator[None]:
-    with rough_fit():
+    """Let a fit take fewer steps and judge fewer logs, which take most of its time; see
+    ``wholly_fitted``."""
+    with _fit_of(200, 8):
         yield
 
 
@@ -399,7 +388,7 @@ def made_bundle(small_grasps: Recordings, made_once) -> Path:
             "5",
             "--quiet",
         ]
-        with without_export(), rough_fit():
+        with without_export():
             assert main(command) == 0
 
     return made_once("bundle", make) / "robot.bundle"
@@ -456,7 +445,7 @@ def forces_home(small_grasps: Recordings, made_once) -> Path:
         write_forces(home, held)
         training = ["train", str(home / "grasps"), "--targets", str(home / "targets.csv")]
         training += ["--epochs", "8", "--learning-rate", "1e-3", "--quiet"]
-        with without_export(), rough_fit():
+        with without_export():
             assert main([*training, "--out", str(home / "robot.bundle")]) == 0
         bundled = Bundle.open(home / "robot.bundle").parts.adapter()
         save_model(

@@ -5,7 +5,6 @@ import json
 
 import numpy as np
 import pytest
-from conftest import rough_fit
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
@@ -118,8 +117,7 @@ def fitted_on(layout: SensorLayout) -> SelfDiagnosis:
     """The diagnosis of a layout, fitted once."""
     name = json.dumps(layout.to_dict())
     if name not in FITTED:
-        with rough_fit():
-            FITTED[name] = SelfDiagnosis(layout).fit(touched(layout, 1))
+        FITTED[name] = SelfDiagnosis(layout).fit(touched(layout, 1))
     return FITTED[name]
 
 

@@ -14,6 +14,7 @@ from typing import Any
 import hypothesis
 import numpy as np
 import pytest
+from fits import fits_made_once
 
 from adaptfault.bundle.bundle import Bundle
 from adaptfault.cli import main
@@ -365,6 +366,24 @@ def rough_fits() -> Iterator[None]:
     ``wholly_fitted``."""
     with _fit_of(200, 8):
         yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def fits_of_the_session(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Let a fit to the same recordings be made once; see ``fitted_anew``."""
+    home = tmp_path_factory.getbasetemp()
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        home = home.parent
+    folder = home / "fits"
+    folder.mkdir(exist_ok=True)
+    with fits_made_once(folder):
+        yield
+
+
+@pytest.fixture
+def fitted_anew(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let each fit be computed, where that is what is proven."""
+    monkeypatch.setattr(SelfDiagnosis, "_fit", SelfDiagnosis._fit.__wrapped__)
 
 
 @pytest.fixture

@@ -143,6 +143,7 @@ def test_the_demo_runs_on_the_users_recordings_and_writes_a_report_that_needs_no
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("fitted_anew")
 def test_training_again_gives_the_same_model(home, tmp_path):
     for name in ("first", "again"):
         command = [

@@ -348,7 +348,8 @@ def all_trees(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @contextmanager
-def _fit_of(steps: int, logs: int) -> Iterator[None]:
+def fit_of(steps: int, logs: int) -> Iterator[None]:
+    """Let a fit take so many steps and judge so many logs."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("diagnostics.model.predictor._STEPS", steps)
         patch.setattr("diagnostics.model.fitting._LOGS", logs)
@@ -357,14 +358,14 @@ def _fit_of(steps: int, logs: int) -> Iterator[None]:
 
 def whole_fit() -> AbstractContextManager[None]:
     """Let a fit take all its steps and judge all its logs, where its accuracy is what is proven."""
-    return _fit_of(_STEPS, _LOGS)
+    return fit_of(_STEPS, _LOGS)
 
 
 @pytest.fixture(scope="session", autouse=True)
 def rough_fits() -> Iterator[None]:
     """Let a fit take fewer steps and judge fewer logs, which take most of its time; see
     ``wholly_fitted``."""
-    with _fit_of(200, 8):
+    with fit_of(200, 8):
         yield
 
 

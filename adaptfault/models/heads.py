@@ -211,14 +211,13 @@ def fit_head(
     all_held = []
     for joint in (True, False):
         weights, found = _regression(of_windows.upper(joint=joint), task, folds)
-        scale, outputs = task.outputs(found)
+        scale, of_kernel = task.outputs(found)
         all_weights.append(weights * scale.to(on))
-        all_held.append(outputs)
+        all_held.append(of_kernel)
     shares = task.shares(all_held)
-    mixed = mixture(all_held, shares, values=values)
+    outputs = mixed = mixture(all_held, shares, values=values)
     trees = Forest.blank(task.targets.shape[1])
     pooling = torch.tensor([1.0, 0.0])
-    outputs = mixed
     if forest:
         course = both.course.cpu().numpy()
         trees, grown = task.said(*fit_forest(course, task.targets.numpy(), folds, values=values))

@@ -14,7 +14,7 @@ from typing import Any
 import hypothesis
 import numpy as np
 import pytest
-from fits import fits_made_once
+from fits import made_once_each
 
 from adaptfault.bundle.bundle import Bundle
 from adaptfault.cli import main
@@ -370,14 +370,15 @@ def rough_fits() -> Iterator[None]:
 
 
 @pytest.fixture(scope="session", autouse=True)
-def fits_of_the_session(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """Let a fit to the same recordings be made once; see ``fitted_anew``."""
+def each_made_once(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Let a fit to the same recordings, and an inspection of the same log, be made once; see
+    ``fitted_anew``."""
     home = tmp_path_factory.getbasetemp()
     if "PYTEST_XDIST_WORKER" in os.environ:
         home = home.parent
-    folder = home / "fits"
+    folder = home / "made_once"
     folder.mkdir(exist_ok=True)
-    with fits_made_once(folder):
+    with made_once_each(folder):
         yield
 
 

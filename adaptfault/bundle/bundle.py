@@ -156,7 +156,7 @@ class Bundle:
 
         Args:
             path: folder to create; must not exist.
-            model: the fault-free model; version 1 is this model, see ``head``.
+            model: the fault-free model, which is version 1.
             adapter: of the same model; its windows are stored, at most 20 MB of them.
             diagnoser: fitted on fault-free recordings.
             check: held-out fault-free labelled windows, as the test windows of ``split``, on which
@@ -164,11 +164,9 @@ class Bundle:
                 validation windows.
             class_names: one name a class, or a value of a regression; or none.
             calibration: from raw counts to the layout's unit, if recordings are raw counts.
-            head: of version 1. "auto": fitted in closed form where it improves validation, as for a
-                repair (:attr:`~adaptfault.adaptation.adapter.Adapter.healthy`). "linear": the
-                model's own.
-            sign: PEM file of the private key that signs the bundle before it gets its name; None:
-                it is not signed.
+            head: of version 1. "auto": of :attr:`~adaptfault.adaptation.adapter.Adapter.healthy`.
+                "linear": the model's own.
+            sign: PEM file of the private key that signs the bundle; None: it is not signed.
 
         Raises:
             FileExistsError: ``path`` exists.

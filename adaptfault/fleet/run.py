@@ -101,14 +101,13 @@ def maintain_fleet(
             lines.begin({"schema": SCHEMA, "options": options, "began": began})
         left = [robot for robot in fleet.robots if robot.name not in done]
         hide = None if progress is None else not progress
-        with (
-            tqdm(total=len(fleet), initial=len(done), unit="robot", disable=hide) as bar,
-            engine(task, jobs=jobs, dask=dask) as work,
-        ):
-            for outcome in work(left):
+        with engine(task, jobs=jobs, dask=dask) as work:
+            every = tqdm(
+                work(left), total=len(fleet), initial=len(done), unit="robot", disable=hide
+            )
+            for outcome in every:
                 lines.add({"time": now(), "outcome": outcome.to_dict()})
                 done[outcome.robot.name] = outcome
-                bar.update()
         lines.add({"time": now(), "ended": True})
     return FleetReport(
         tuple(done[robot.name] for robot in fleet.robots), began, now(), dry_run, fleet.source

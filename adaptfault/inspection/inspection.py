@@ -1,4 +1,8 @@
-"""Inspection of a log: everything that is told of it."""
+"""Inspection of a log: everything that is told of it.
+
+What all cells share is explained first: it is taken out where it can be, and where that leaves
+fewer faults. Then the wiring and replaced pads are undone, and then cells are judged.
+"""
 
 from __future__ import annotations
 
@@ -38,9 +42,6 @@ def inspect(
 ) -> Inspection:
     """Return everything that a log tells about a sensor.
 
-    What all cells share is explained first: it is taken out where it can be, and where that leaves
-    fewer faults. Then the wiring and replaced pads are undone, and then cells are judged.
-
     Args:
         recordings: the log, ``[T, D]`` or a list of them, in the layout's unit, in time order.
         diagnoser: fitted on healthy recordings of the same array; one that is not fitted is a cold
@@ -58,10 +59,7 @@ def inspect(
     shared = diagnoser.shared(recordings)
     given = list(RecordingBlocks(shared.recordings))
     log = [within_range(frames, layout)[0] for frames in given]
-    healthy: list[NDArray[np.float64]] = []
-    if reference is not None:
-        usable = RecordingBlocks(measured(checked_recordings(reference, layout), layout))
-        healthy = [within_range(frames, layout)[0] for frames in usable]
+    healthy = [] if reference is None else _usable(reference, layout)
     if shared.explains_all:
         diagnosis = shared.diagnosis()
         alone = ChangedReadings(None, None, log, diagnosis)
@@ -95,6 +93,14 @@ def inspect(
             finding_of("coincides", text) for text in coinciding(readings.diagnosis, classes)
         ]
     return Inspection(readings, tuple(findings), told.change, told.common)
+
+
+def _usable(
+    reference: ArrayLike | Sequence[ArrayLike], layout: SensorLayout
+) -> list[NDArray[np.float64]]:
+    """Return the recordings of a reference as :func:`inspect` compares them."""
+    usable = RecordingBlocks(measured(checked_recordings(reference, layout), layout))
+    return [within_range(frames, layout)[0] for frames in usable]
 
 
 @dataclass

@@ -59,9 +59,8 @@ def write_report(
     problems = bundle.problems(repair=False)
     if run is not None:
         state = _state_after(run, bundle, state)
-    unhandled = by_group(
-        [fault for fault in state.known.faults if fault in state.unhandled], bundle.layout
-    )
+    used = [fault for fault in state.known.faults if fault in state.unhandled]
+    unhandled = by_group(used, bundle.layout)
     recalls = [] if run is not None and run.dry_run else list(bundle.class_recalls())
     recalls.sort(key=lambda one: one.low)
     handled = [fault for fault in state.known.faults if fault not in state.unhandled]

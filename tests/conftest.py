@@ -333,18 +333,21 @@ def without_export() -> Iterator[None]:
 
 @pytest.fixture(scope="session", autouse=True)
 def few_trees() -> Iterator[None]:
-    """Let a head have fewer trees, which take most of its time; see ``all_trees``."""
+    """Let heads, and the check of rest levels, have fewer trees, which take most of their time; see
+    ``all_trees``."""
     with pytest.MonkeyPatch.context() as patch:
         for module in _WITH_TREES:
             patch.setattr(f"adaptfault.models.{module}.TREES", 8)
+        patch.setattr("adaptfault.evaluation.training_check._TREES", 8)
         yield
 
 
 @pytest.fixture
 def all_trees(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let a head have all its trees, where its accuracy is what is proven."""
+    """Let them have all their trees, where accuracy is what is proven."""
     for module in _WITH_TREES:
         monkeypatch.setattr(f"adaptfault.models.{module}.TREES", _TREES)
+    monkeypatch.setattr("adaptfault.evaluation.training_check._TREES", 100)
 
 
 @contextmanager

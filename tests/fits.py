@@ -1,7 +1,7 @@
 """What tests share: a diagnosis that is fitted again to the same recordings is the first one, and
-so is what an inspection tells of the same log.
+so are what an inspection tells of the same log, and the adaptation of a bundle to the same faults.
 
-Both depend on what they are given alone, as tests prove that compute them anew. What was made is
+They depend on what they are given alone, as tests prove that compute them anew. What was made is
 kept as a file, so that nobody changes what another test gets.
 """
 
@@ -18,8 +18,12 @@ from typing import Any
 
 import pytest
 
+from adaptfault.adaptation.adapter import Adapter
+from adaptfault.adaptation.result import Adaptation
+from adaptfault.bundle.parts import Parts
 from adaptfault.robot import maintenance
 from diagnostics import SelfDiagnosis
+from diagnostics.faults import Cells
 from diagnostics.model import fitting, predictor
 
 Progress = Callable[[float], None]
@@ -39,10 +43,11 @@ def kept(folder: Path, asked: Any, make: Callable[[], Any]) -> Any:
 
 @contextmanager
 def made_once_each(folder: Path) -> Iterator[None]:
-    """Make each fit, and each inspection of a maintenance run, once for all processes that share
-    the folder."""
+    """Make each fit, each inspection of a maintenance run, and each adaptation of a bundle without
+    a budget, once for all processes that share the folder."""
     fit = SelfDiagnosis._fit
     inspect = maintenance.inspect
+    adapter_of = Parts.adapter
 
     @functools.wraps(fit)
     def fit_once(
@@ -65,7 +70,22 @@ def made_once_each(folder: Path) -> Iterator[None]:
         asked = ("inspect", recordings, vars(diagnoser), reference)
         return kept(folder, asked, lambda: inspect(recordings, diagnoser, reference=reference))
 
+    def adapter_once(parts: Parts) -> Adapter:
+        adapter = adapter_of(parts)
+        adapt = adapter.adapt
+        hashes = sorted(parts._files.below("adapter").hashes.items())
+
+        def adapt_once(faulty: Cells, **stated: Any) -> Adaptation:
+            if stated.get("budget") is not None:
+                return adapt(faulty, **stated)
+            asked = ("adapt", hashes, tuple(faulty), sorted(stated.items()))
+            return kept(folder, asked, lambda: adapt(faulty, **stated))
+
+        adapter.__dict__["adapt"] = adapt_once
+        return adapter
+
     with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Parts, "adapter", adapter_once)
         patch.setattr(SelfDiagnosis, "_fit", fit_once)
         patch.setattr(maintenance, "inspect", inspect_once)
         yield

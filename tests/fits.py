@@ -31,6 +31,8 @@ Progress = Callable[[float], None]
 
 def kept(folder: Path, asked: Any, make: Callable[[], Any]) -> Any:
     """Return what was made for the same question, by any process that shares the folder."""
+    if not os.access(folder, os.R_OK | os.W_OK | os.X_OK, effective_ids=True):
+        return make()  # for a test that runs as another user
     rough = (predictor._STEPS, fitting._LOGS)
     place = folder / hashlib.blake2b(pickle.dumps((asked, rough)), digest_size=16).hexdigest()
     if not place.exists():

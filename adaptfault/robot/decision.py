@@ -33,7 +33,7 @@ class Outcome:
     """What was decided.
 
     Attributes:
-        decision: see :class:`MaintenanceReport`.
+        decision: see :class:`~adaptfault.robot.maintenance_report.MaintenanceReport`.
         reasons: of the decision.
         known: the known faults from now on.
         readings: of the log, as the version that runs from now on takes them; None: nothing was

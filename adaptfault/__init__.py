@@ -56,7 +56,8 @@ if TYPE_CHECKING:
     from adaptfault.models.value_units import ValueUnits
     from adaptfault.prediction.export import add_onnx
     from adaptfault.prediction.inference import Inference
-    from adaptfault.prediction.predictor import Predictor, Reading
+    from adaptfault.prediction.predictor import Predictor
+    from adaptfault.prediction.reading import Reading
     from adaptfault.robot.maintenance import maintain
     from adaptfault.robot.maintenance_report import MaintenanceReport
     from adaptfault.robot.ros_diagnostics import diagnostic_array, write_diagnostics
@@ -154,7 +155,7 @@ _HOMES = {
     "MaintenanceReport": "robot.maintenance_report",
     "NotAuthentic": "acquisition",
     "Predictor": "prediction.predictor",
-    "Reading": "prediction.predictor",
+    "Reading": "prediction.reading",
     "Receiver": "acquisition",
     "Recorder": "acquisition",
     "Recordings": "data.recordings",

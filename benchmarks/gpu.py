@@ -14,7 +14,7 @@ import torch
 import torch.nn.functional as F
 
 from adaptfault.models.network import TactileTransformer, logits_of
-from adaptfault.models.training import Optimisation
+from adaptfault.models.training_run import Optimisation
 from diagnostics import SensorLayout
 
 CLASSES = 7

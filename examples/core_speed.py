@@ -36,7 +36,7 @@ from torch.utils.flop_counter import FlopCounterMode
 
 import adaptfault as af
 from adaptfault.adaptation.reduced_model import ReducedModel, phi
-from adaptfault.models import training
+from adaptfault.models import training_run
 from adaptfault.models.compact import CompactNetwork
 from adaptfault.models.store import load_model, save_model
 from diagnostics import FaultSet, Monitor, SelfDiagnosis, SensorLayout
@@ -111,7 +111,7 @@ def size_of(module: nn.Module) -> int:
 
 def step_of(model: nn.Module, x: Tensor, y: Tensor) -> Callable[[], object]:
     """Return one step of adaptfault's training loop."""
-    run = training.Optimisation(model.train(), 1e-4, 0.995)
+    run = training_run.Optimisation(model.train(), 1e-4, 0.995)
 
     def step() -> float:
         loss = F.cross_entropy(model(x), y)

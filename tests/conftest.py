@@ -14,6 +14,7 @@ from typing import Any
 import hypothesis
 import numpy as np
 import pytest
+from fits import made_once_each
 
 from adaptfault.bundle.bundle import Bundle
 from adaptfault.cli import main
@@ -332,50 +333,62 @@ def without_export() -> Iterator[None]:
 
 @pytest.fixture(scope="session", autouse=True)
 def few_trees() -> Iterator[None]:
-    """Let a head have fewer trees, which take most of its time; see ``all_trees``."""
+    """Let heads, and the check of rest levels, have fewer trees, which take most of their time; see
+    ``all_trees``."""
     with pytest.MonkeyPatch.context() as patch:
         for module in _WITH_TREES:
             patch.setattr(f"adaptfault.models.{module}.TREES", 8)
+        patch.setattr("adaptfault.evaluation.training_check._TREES", 8)
         yield
 
 
 @pytest.fixture
 def all_trees(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let a head have all its trees, where its accuracy is what is proven."""
+    """Let them have all their trees, where accuracy is what is proven."""
     for module in _WITH_TREES:
         monkeypatch.setattr(f"adaptfault.models.{module}.TREES", _TREES)
+    monkeypatch.setattr("adaptfault.evaluation.training_check._TREES", 100)
 
 
 @contextmanager
-def _fit_of(steps: int, logs: int) -> Iterator[None]:
+def fit_of(steps: int, logs: int) -> Iterator[None]:
+    """Let a fit take so many steps and judge so many logs."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("diagnostics.model.predictor._STEPS", steps)
         patch.setattr("diagnostics.model.fitting._LOGS", logs)
         yield
 
 
-def rough_fit() -> AbstractContextManager[None]:
-    """Let a fit take fewer steps and judge fewer logs, which take most of its time, where accuracy
-    is not what is proven."""
-    return _fit_of(200, 8)
-
-
 def whole_fit() -> AbstractContextManager[None]:
     """Let a fit take all its steps and judge all its logs, where its accuracy is what is proven."""
-    return _fit_of(_STEPS, _LOGS)
+    return fit_of(_STEPS, _LOGS)
 
 
 @pytest.fixture(scope="session", autouse=True)
 def rough_fits() -> Iterator[None]:
-    """Let fits be rough; see ``wholly_fitted``."""
-    with rough_fit():
+    """Let a fit take fewer steps and judge fewer logs, which take most of its time; see
+    ``wholly_fitted``."""
+    with fit_of(200, 8):
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def each_made_once(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Let a fit to the same recordings, and an inspection of the same log, be made once; see
+    ``fitted_anew``."""
+    home = tmp_path_factory.getbasetemp()
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        home = home.parent
+    folder = home / "made_once"
+    folder.mkdir(exist_ok=True)
+    with made_once_each(folder):
         yield
 
 
 @pytest.fixture
-def roughly_fitted() -> Iterator[None]:
-    with rough_fit():
-        yield
+def fitted_anew(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let each fit be computed, where that is what is proven."""
+    monkeypatch.setattr(SelfDiagnosis, "_fit", SelfDiagnosis._fit.__wrapped__)
 
 
 @pytest.fixture
@@ -399,7 +412,7 @@ def made_bundle(small_grasps: Recordings, made_once) -> Path:
             "5",
             "--quiet",
         ]
-        with without_export(), rough_fit():
+        with without_export():
             assert main(command) == 0
 
     return made_once("bundle", make) / "robot.bundle"
@@ -456,7 +469,7 @@ def forces_home(small_grasps: Recordings, made_once) -> Path:
         write_forces(home, held)
         training = ["train", str(home / "grasps"), "--targets", str(home / "targets.csv")]
         training += ["--epochs", "8", "--learning-rate", "1e-3", "--quiet"]
-        with without_export(), rough_fit():
+        with without_export():
             assert main([*training, "--out", str(home / "robot.bundle")]) == 0
         bundled = Bundle.open(home / "robot.bundle").parts.adapter()
         save_model(

@@ -134,11 +134,11 @@ class Adapter(FaultFreeModel):
             outputs["fill"] = run.held_out()
             run.head()
             outputs["head"] = run.held_out()
-        if self.task == "regression":
-            values = {name: out.numpy() for name, out in outputs.items()}
-            return Forecast.of_values(fault_set, windows.y, windows.recording, values, recordings)
-        predicted = {name: out.argmax(1).numpy() for name, out in outputs.items()}
-        likely = {name: np.exp(log_likelihood(out, windows.y)) for name, out in outputs.items()}
+        predicted = {name: out.numpy() for name, out in outputs.items()}
+        likely = None
+        if self.task == "classification":
+            predicted = {name: out.argmax(1) for name, out in predicted.items()}
+            likely = {name: np.exp(log_likelihood(out, windows.y)) for name, out in outputs.items()}
         return Forecast.of(fault_set, windows.y, windows.recording, predicted, recordings, likely)
 
     def to(self, device: str | torch.device) -> Adapter:

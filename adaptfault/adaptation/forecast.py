@@ -103,58 +103,47 @@ class Forecast:
     def of(
         cls,
         fault_set: FaultSet,
-        y: NDArray[np.int64],
+        y: NDArray[Any],
         recording: NDArray[np.int64],
-        predicted: Mapping[str, NDArray[np.int64]],
+        predicted: Mapping[str, NDArray[Any]],
         new: float | None = None,
         likely: Mapping[str, NDArray[np.floating]] | None = None,
     ) -> Forecast:
-        """Build a forecast from the classes ``[N]`` that each measured stage predicted for
-        validation windows.
+        """Build a forecast from what each measured stage predicted for validation windows.
 
-        ``likely`` are the probabilities ``[N]`` that each stage gave the true class.
+        Args:
+            fault_set: F.
+            y: classes ``[N]``, or values ``[N, k]``.
+            recording: of each window, ``[N]``.
+            predicted: by each stage, as ``y``.
+            new: number of new recordings; None: as many.
+            likely: the probabilities ``[N]`` that each stage gave the true class.
         """
-        stages = {
-            name: Expected.of(
-                classes == y, recording, new, None if likely is None else likely[name]
-            )
-            for name, classes in predicted.items()
-        }
+        values = y.ndim == 2
+        stages = {}
+        for name, answers in predicted.items():
+            if values:
+                shares = explained(y, answers).mean(axis=1)  # its mean is R2
+                stages[name] = Expected.of_errors(shares, recording, new)
+            else:
+                of_true = likely[name] if likely else None
+                stages[name] = Expected.of(answers == y, recording, new, of_true)
+        best = "fault-free"
+        if len(stages) > 1:
+            best = max("fill", "head", key=lambda name: stages[name].accuracy)
+            reached = stages[best]
+            trained = replace(reached, high=max(reached.high, stages["fault-free"].high))
+            stages |= {"finetune": trained, "scratch": trained}
         count = len(np.unique(recording))
         new = count if new is None else new
-        if len(predicted) == 1:
-            recalls = class_recalls(y, predicted["fault-free"], recording, new=new)
-            return cls(fault_set, stages, None, 0.0, count, new, classes=recalls)
-        best = _add_trained(stages)
-        last = predicted["fill" if best is stages["fill"] else "head"]
-        recalls = class_recalls(y, last, recording, new=new)
-        classes = np.unique(y)
-        lost = [
-            ((predicted["fault-free"] == y) * 1.0 - (last == y))[y == c].mean() for c in classes
-        ]
-        worst = int(np.argmax(lost))
-        loss = float(lost[worst])
-        return cls(fault_set, stages, int(classes[worst]), loss, count, new, classes=recalls)
-
-    @classmethod
-    def of_values(
-        cls,
-        fault_set: FaultSet,
-        y: NDArray[np.float32],
-        recording: NDArray[np.int64],
-        predicted: Mapping[str, NDArray[np.float32]],
-        new: float | None = None,
-    ) -> Forecast:
-        """Build a forecast from the values ``[N, k]`` that each measured stage predicted for
-        validation windows."""
-        stages = {}
-        for name, values in predicted.items():
-            shares = explained(y, values).mean(axis=1)  # its mean is R2
-            stages[name] = Expected.of_errors(shares, recording, new)
-        if len(predicted) > 1:
-            _add_trained(stages)
-        count = len(np.unique(recording))
-        return cls(fault_set, stages, None, 0.0, count, count if new is None else new, "R2")
+        if values:
+            return cls(fault_set, stages, None, 0.0, count, new, "R2")
+        recalls = class_recalls(y, predicted[best], recording, new=new)
+        gains = (predicted["fault-free"] == y) * 1.0 - (predicted[best] == y)
+        lost = {c: float(gains[y == c].mean()) for c in np.unique(y).tolist()}
+        worst = max(lost, key=lost.__getitem__)
+        label = None if best == "fault-free" else worst
+        return cls(fault_set, stages, label, lost[worst], count, new, classes=recalls)
 
     def __str__(self) -> str:
         k = len(self.fault_set)
@@ -179,11 +168,3 @@ class Forecast:
     def to_dict(self) -> dict[str, Any]:
         """Return a JSON-safe dict."""
         return {"schema": SCHEMA, **members(self)}
-
-
-def _add_trained(stages: dict[str, Expected]) -> Expected:
-    """Add the stages that need training; return the best measured one."""
-    best = max(stages["fill"], stages["head"], key=lambda e: e.accuracy)
-    trained = replace(best, high=max(best.high, stages["fault-free"].high))
-    stages |= {"finetune": trained, "scratch": trained}
-    return best

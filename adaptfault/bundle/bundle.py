@@ -156,7 +156,7 @@ class Bundle:
 
         Args:
             path: folder to create; must not exist.
-            model: the fault-free model; version 1 is this model, see ``head``.
+            model: the fault-free model, which is version 1.
             adapter: of the same model; its windows are stored, at most 20 MB of them.
             diagnoser: fitted on fault-free recordings.
             check: held-out fault-free labelled windows, as the test windows of ``split``, on which
@@ -164,11 +164,9 @@ class Bundle:
                 validation windows.
             class_names: one name a class, or a value of a regression; or none.
             calibration: from raw counts to the layout's unit, if recordings are raw counts.
-            head: of version 1. "auto": fitted in closed form where it improves validation, as for a
-                repair (:attr:`~adaptfault.adaptation.adapter.Adapter.healthy`). "linear": the
-                model's own.
-            sign: PEM file of the private key that signs the bundle before it gets its name; None:
-                it is not signed.
+            head: of version 1. "auto": of :attr:`~adaptfault.adaptation.adapter.Adapter.healthy`.
+                "linear": the model's own.
+            sign: PEM file of the private key that signs the bundle; None: it is not signed.
 
         Raises:
             FileExistsError: ``path`` exists.
@@ -176,12 +174,9 @@ class Bundle:
                 kind, the diagnoser is not fitted, or ``head`` is unknown.
         """
         path = Path(path)
-        _check_parts(path, model, adapter, diagnoser, class_names, head)
-        if check is not None and check.y.shape[1:] != adapter.validation.y.shape[1:]:
-            raise ValueError(
-                f"check has targets [N{_more(check)}], the adapter [N{_more(adapter.validation)}]:"
-                " give windows with the same classes or values"
-            )
+        _check_parts(path, model, adapter, diagnoser, class_names, check)
+        if head not in ("auto", "linear"):
+            raise ValueError(f"unknown head {head!r}: use 'auto' or 'linear'")
         make_folder(path.parent)
         new = path.with_name(f".{path.name}.unfinished")
         shutil.rmtree(new, ignore_errors=True)  # left by a crash
@@ -198,11 +193,7 @@ class Bundle:
         write_with_copy(new / _ABOUT, about)
         bundle = cls(new)
         Pointer(active=1).write(new)
-        first = (
-            adapter.healthy
-            if head == "auto"
-            else adapter.adapt(FaultSet((), model.layout.n_cells), method="fill")
-        )
+        first = adapter.healthy if head == "auto" else adapter.adapt((), method="fill")
         bundle.write_version(first, {"reason": "the fault-free model"})
         if sign is not None:
             bundle.sign(sign, {1})
@@ -530,12 +521,10 @@ def _check_parts(
     adapter: Adapter,
     diagnoser: SelfDiagnosis,
     class_names: Sequence[str],
-    head: str,
+    check: Windows | None,
 ) -> None:
     """Refuse parts that make no bundle, before anything is written; the errors are those of
     :meth:`Bundle.create`."""
-    if head not in ("auto", "linear"):
-        raise ValueError(f"unknown head {head!r}: use 'auto' or 'linear'")
     if path.exists():
         raise FileExistsError(f"{path} exists: choose another name, or remove it")
     if not diagnoser.layout.shape == adapter.model.layout.shape == model.layout.shape:
@@ -544,6 +533,11 @@ def _check_parts(
             f" {diagnoser.layout}"
         )
     check_names(class_names, model.n_classes, adapter.task)
+    if check is not None and check.y.shape[1:] != adapter.validation.y.shape[1:]:
+        raise ValueError(
+            f"check has targets [N{_more(check)}], the adapter [N{_more(adapter.validation)}]:"
+            " give windows with the same classes or values"
+        )
 
 
 def _more(windows: Windows) -> str:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -132,47 +133,72 @@ def run_demo(
     layout = recordings.layout
     if recordings.labels is None:
         raise ValueError("the recordings have no labels: the demo trains a classifier")
-    clock = _Clock({})
-    rng = np.random.default_rng(seed)
+    seconds: dict[str, float] = {}
     windows = make_windows(recordings.frames, recordings.labels, layout)
     training, validation, test = split(windows, seed=seed)
-    healthy = [recordings.frames[i] for i in np.unique(training.recording)]
     say(
         f"recordings   {len(recordings)} of {layout}; {len(recordings.class_names)} classes,"
         f" {len(windows)} windows"
     )
-
-    # Train.
     model = TactileTransformer(layout, len(recordings.class_names), seed=seed, **(network or {}))
     options: dict[str, Any] = {"checkpoint": checkpoint, "progress": progress, "seed": seed}
-    with clock("training"):
+    with _timed(seconds, "training"):
         history = train(
             model, training, validation, epochs=epochs, learning_rate=learning_rate, **options
         )
     say(f"training     {history}")
     adapter = Adapter(model, training, validation)
+    result = _repaired(recordings, adapter, test, faults, history, seconds, seed, progress, say)
+    say(f"repaired     {result.repaired}")
+    say(_summary(result))
+    return result
+
+
+def _repaired(
+    recordings: Recordings,
+    adapter: Adapter,
+    test: Windows,
+    faults: Sequence[Fault] | None,
+    history: History,
+    seconds: dict[str, float],
+    seed: int,
+    progress: bool | None,
+    say: Callable[[str], None],
+) -> DemoResult:
+    """Break the sensor, diagnose it, and repair the model of the adapter.
+
+    Args:
+        adapter: with the trained model.
+        test: fault-free windows that it has not seen.
+        history: of the training.
+        seconds: of each step; the further steps are added.
+        recordings, faults, seed, progress, say: as in :func:`run_demo`.
+    """
+    layout = recordings.layout
+    rng = np.random.default_rng(seed)
+    healthy = [recordings.frames[i] for i in np.unique(adapter.train.recording)]
+    tested = np.unique(test.recording)
     deployed = adapter.healthy
     fault_free = _score(deployed, test)
     say(f"fault-free   {fault_free[0]}")
-
-    # Break.
     injected = tuple(default_faults(healthy, layout, rng) if faults is None else faults)
-    broken, broken_windows = _broken(recordings, np.unique(test.recording), injected, seed)
+    broken, broken_windows = _broken(recordings, tested, injected, seed)
     collapsed = _score(deployed, broken_windows)
     say(f"broken       {len({c for fault in injected for c in fault.cells})} cells; {collapsed[0]}")
     _list(say, [fault.describe(layout) for fault in injected])
-
-    # Diagnose and repair.
     log = [broken[i] for i in rng.permutation(len(broken))[:_LOG_RECORDINGS]]
-    diagnosis = _diagnosed(layout, healthy, log, clock)
-    say(_found(diagnosis, injected, len(log), clock.seconds["diagnosis"]))
+    with _timed(seconds, "fitting the healthy model"):
+        diagnoser = SelfDiagnosis(layout).fit(healthy)
+    with _timed(seconds, "diagnosis"):
+        diagnosis = diagnoser.diagnose(log)
+    say(_found(diagnosis, injected, len(log), seconds["diagnosis"]))
     _list(say, [fault.reason for fault in diagnosis.faults])
-    with clock("adaptation"):
+    with _timed(seconds, "adaptation"):
         adaptation = adapter.adapt(diagnosis.fault_set, seed=seed, progress=progress)
     for stage in adaptation.stages:
         say(f"adaptation   {stage}")
     repaired = _score(adaptation, broken_windows)
-    result = DemoResult(
+    return DemoResult(
         recordings=recordings,
         seed=seed,
         injected=injected,
@@ -184,14 +210,9 @@ def run_demo(
         diagnosis=diagnosis,
         adaptation=adaptation,
         n_log=len(log),
-        seconds=clock.seconds,
-        maps=_force_maps(
-            [recordings.frames[i] for i in np.unique(test.recording)], broken, adaptation, layout
-        ),
+        seconds=seconds,
+        maps=_force_maps([recordings.frames[i] for i in tested], broken, adaptation, layout),
     )
-    say(f"repaired     {result.repaired}")
-    say(_summary(result))
-    return result
 
 
 def _broken(
@@ -201,19 +222,6 @@ def _broken(
     layout = recordings.layout
     broken = [inject(recordings.frames[i], faults, layout, seed=seed + int(i)) for i in which]
     return broken, _labelled(make_windows(broken, None, layout), which, recordings)
-
-
-def _diagnosed(
-    layout: SensorLayout,
-    healthy: Sequence[NDArray[Any]],
-    log: Sequence[NDArray[np.float64]],
-    clock: _Clock,
-) -> Diagnosis:
-    """Fit the healthy model, and diagnose the log."""
-    with clock("fitting the healthy model"):
-        diagnoser = SelfDiagnosis(layout).fit(healthy)
-    with clock("diagnosis"):
-        return diagnoser.diagnose(log)
 
 
 def _summary(result: DemoResult) -> str:
@@ -315,18 +323,9 @@ def _force_maps(
     }
 
 
-class _Clock:
-    """Measures steps."""
-
-    def __init__(self, seconds: dict[str, float]) -> None:
-        self.seconds = seconds
-
-    def __call__(self, step: str) -> _Clock:
-        self.step = step
-        return self
-
-    def __enter__(self) -> None:
-        self.began = time.perf_counter()
-
-    def __exit__(self, *_: object) -> None:
-        self.seconds[self.step] = time.perf_counter() - self.began
+@contextmanager
+def _timed(seconds: dict[str, float], step: str) -> Iterator[None]:
+    """Add the wall clock of a step."""
+    began = time.perf_counter()
+    yield
+    seconds[step] = time.perf_counter() - began

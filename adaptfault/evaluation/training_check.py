@@ -23,6 +23,9 @@ _LOWEST = 0.05
 _FOLDS = 5
 """Of a cross-validation, and the least recordings of a class in it."""
 
+_TREES = 100
+"""Of what predicts the class from the lowest readings."""
+
 _SHOWN = 4
 """Values that the picture of a training shows."""
 
@@ -94,7 +97,7 @@ def rest_level_note(
         return ""
     lowest = np.stack([np.quantile(np.nan_to_num(of), _LOWEST, axis=0) for of in frames])
     reached = cross_val_score(
-        ExtraTreesClassifier(100, random_state=0),
+        ExtraTreesClassifier(_TREES, random_state=0),
         lowest[enough],
         labels[enough],
         cv=StratifiedKFold(_FOLDS, shuffle=True, random_state=0),

@@ -78,15 +78,11 @@ def maintain_fleet(
     """
     from adaptfault.fleet.summary import FleetReport
 
-    if jobs is not None and (jobs < 1 or dask is not None):
-        raise ValueError(
-            f"jobs {jobs}: expected at least 1, and none with a Dask cluster, which has its own"
-            " workers"
-        )
     if limit is not None and not limit > 0:
         raise ValueError(f"limit {limit}: expected seconds, more than 0")
     if sign is not None and not keys:  # whatever lies in the bundle would be signed
         raise ValueError("sign needs keys: only a bundle that a trusted key signed is signed again")
+    _check_workers(jobs, dask)
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     with locked(folder / "run.lock", patience=0):
@@ -96,28 +92,34 @@ def maintain_fleet(
             "budget": budget,
             "least_serial": least_serial,
             "sign": sign,
+            "keys": None if keys is None else list(map(str, keys)),
         }
-        options["keys"] = None if keys is None else list(map(str, keys))
+        task = Task(partial(maintain_robot, **options), ready, limit)
         began, done = _resumed(lines, fleet, options)
         if not done:
             began = now()
             lines.begin({"schema": SCHEMA, "options": options, "began": began})
         left = [robot for robot in fleet.robots if robot.name not in done]
         hide = None if progress is None else not progress
-        with (
-            tqdm(total=len(fleet), initial=len(done), unit="robot", disable=hide) as bar,
-            engine(
-                Task(partial(maintain_robot, **options), ready, limit), jobs=jobs, dask=dask
-            ) as work,
-        ):
-            for outcome in work(left):
+        with engine(task, jobs=jobs, dask=dask) as work:
+            every = tqdm(
+                work(left), total=len(fleet), initial=len(done), unit="robot", disable=hide
+            )
+            for outcome in every:
                 lines.add({"time": now(), "outcome": outcome.to_dict()})
                 done[outcome.robot.name] = outcome
-                bar.update()
         lines.add({"time": now(), "ended": True})
     return FleetReport(
         tuple(done[robot.name] for robot in fleet.robots), began, now(), dry_run, fleet.source
     )
+
+
+def _check_workers(jobs: int | None, dask: str | None) -> None:
+    if jobs is not None and (jobs < 1 or dask is not None):
+        raise ValueError(
+            f"jobs {jobs}: expected at least 1, and none with a Dask cluster, which has its own"
+            " workers"
+        )
 
 
 @dataclass(frozen=True)

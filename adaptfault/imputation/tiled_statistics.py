@@ -171,8 +171,7 @@ class TiledStatistics:
         means: Floats,
         references: bool,
     ) -> TilePart:
-        variance = float(self.pooled[_REACH - 1, _REACH - 1])
-        if not len(known) or variance == 0:
+        if not len(known) or self.pooled[_REACH - 1, _REACH - 1] == 0:
             return _constant(missing, self.mean[gone], self.frames[:, gone].std(axis=0))
         cells = np.concatenate([around, gone])
         touched = np.flatnonzero(
@@ -186,31 +185,8 @@ class TiledStatistics:
         x = np.concatenate([self.frames[which][:, around], means[which]], axis=1)
         y = self.frames[which][:, gone]
         z = np.concatenate([x - centre, y - self.rest[gone]], axis=1).astype(np.float64)
-        h = len(known)
-        fold = self.fold[which]
         prior = self._prior_with_pads(cells, len(around), means)
-        moments = [repeats * z[fold == side].T @ z[fold == side] for side in (False, True)]
-        frames = [int((self.fold == side).sum()) for side in (False, True)]
-
-        def weights(moment: NDArray[np.float64], n: int) -> NDArray[np.float64]:
-            covariance = (moment + _PRIOR_FRAMES * prior) / (n + _PRIOR_FRAMES)
-            return regression(covariance + _NOISE * variance * np.eye(len(prior)), h)
-
-        predicted = np.empty((len(which), len(gone)))
-        for side in (0, 1):  # each fold by the moments of the other
-            of = fold == bool(side)
-            predicted[of] = z[of, :h] @ weights(moments[1 - side], frames[1 - side]).T
-        weight = weights(moments[0] + moments[1], sum(frames))
-        explained = np.maximum((weight * prior[h:, :h]).sum(axis=1), 0)
-        correction = Recalibration.fit(
-            predicted,
-            z[:, h:],
-            total=sum(frames),
-            repeats=repeats,
-            prior_error=np.maximum(np.diag(prior[h:, h:]) - explained, 0),
-            prior_variance=explained,
-            prior_frames=_GAIN_FRAMES,
-        )
+        weight, correction = self._fitted(z, len(known), self.fold[which], repeats, prior)
         weight = correction.gain[:, None] * weight
         bias = self.rest[gone] + correction.offset - weight @ centre
         chosen = (
@@ -229,6 +205,47 @@ class TiledStatistics:
             (y[chosen] - (x[chosen] @ weight.T + bias)).astype("f4"),
             bandwidth(roots) if len(chosen) else 1.0,
         )
+
+    def _fitted(
+        self,
+        z: NDArray[np.float64],
+        h: int,
+        fold: NDArray[np.bool_],
+        repeats: float,
+        prior: NDArray[np.float64],
+    ) -> tuple[NDArray[np.float64], Recalibration]:
+        """Return the weights ``[m, h]`` of the first h variables of ``z [n, h + m]``, about rest,
+        in the last m, and what corrects their predictions.
+
+        Args:
+            fold: bool ``[n]``, of each frame.
+            repeats: frames that each of the n stands for.
+            prior: covariance ``[h + m, h + m]``.
+        """
+        moments = [repeats * z[fold == side].T @ z[fold == side] for side in (False, True)]
+        frames = [int((self.fold == side).sum()) for side in (False, True)]
+        noise = _NOISE * self.pooled[_REACH - 1, _REACH - 1] * np.eye(len(prior))
+
+        def weights(moment: NDArray[np.float64], n: int) -> NDArray[np.float64]:
+            covariance = (moment + _PRIOR_FRAMES * prior) / (n + _PRIOR_FRAMES)
+            return regression(covariance + noise, h)
+
+        predicted = np.empty((len(z), z.shape[1] - h))
+        for side in (0, 1):  # each fold by the moments of the other
+            of = fold == bool(side)
+            predicted[of] = z[of, :h] @ weights(moments[1 - side], frames[1 - side]).T
+        weight = weights(moments[0] + moments[1], sum(frames))
+        explained = np.maximum((weight * prior[h:, :h]).sum(axis=1), 0)
+        correction = Recalibration.fit(
+            predicted,
+            z[:, h:],
+            total=sum(frames),
+            repeats=repeats,
+            prior_error=np.maximum(np.diag(prior[h:, h:]) - explained, 0),
+            prior_variance=explained,
+            prior_frames=_GAIN_FRAMES,
+        )
+        return weight, correction
 
     def _prior_with_pads(
         self, cells: NDArray[np.intp], h: int, means: Floats

@@ -1,9 +1,13 @@
-"""Inspection of a log: everything that is told of it."""
+"""Inspection of a log: everything that is told of it.
+
+What all cells share is explained first: it is taken out where it can be, and where that leaves
+fewer faults. Then the wiring and replaced pads are undone, and then cells are judged.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -38,9 +42,6 @@ def inspect(
 ) -> Inspection:
     """Return everything that a log tells about a sensor.
 
-    What all cells share is explained first: it is taken out where it can be, and where that leaves
-    fewer faults. Then the wiring and replaced pads are undone, and then cells are judged.
-
     Args:
         recordings: the log, ``[T, D]`` or a list of them, in the layout's unit, in time order.
         diagnoser: fitted on healthy recordings of the same array; one that is not fitted is a cold
@@ -58,10 +59,7 @@ def inspect(
     shared = diagnoser.shared(recordings)
     given = list(RecordingBlocks(shared.recordings))
     log = [within_range(frames, layout)[0] for frames in given]
-    healthy: list[NDArray[np.float64]] = []
-    if reference is not None:
-        usable = RecordingBlocks(measured(checked_recordings(reference, layout), layout))
-        healthy = [within_range(frames, layout)[0] for frames in usable]
+    healthy = [] if reference is None else _usable(reference, layout)
     if shared.explains_all:
         diagnosis = shared.diagnosis()
         alone = ChangedReadings(None, None, log, diagnosis)
@@ -70,51 +68,104 @@ def inspect(
     if any(one.name == "silent_array" for one in disturbances):
         findings = [_finding(one) for one in disturbances]
         return Inspection(ChangedReadings(None, None, log, _untold(log, layout)), tuple(findings))
-    common = None
-    amplified = 1.0
+    crosstalk = shared.crosstalk is not None
     if diagnoser.reference_ is None:
         fitted = diagnoser.for_log(log, classes=classes, progress=progress)
-        readings = ChangedReadings(None, None, log, fitted.diagnose(log, classes=classes))
+        alone = ChangedReadings(None, None, log, fitted.diagnose(log, classes=classes))
+        told = _Told(alone, None, disturbances)
+        if not crosstalk:
+            told.change = _change(alone, healthy, diagnoser, disturbances)
     else:
-        told = shared.crosstalk is not None
-        told |= any(one.name in _OF_ALL_CELLS for one in disturbances)
-        # Crosstalk of lines is what the cells of a pad share, too.
-        compared = healthy if shared.crosstalk is None else []
-        readings, common = _judged(log, compared, diagnoser, disturbed=told)
-        others = _without_groups(log, readings.diagnosis)
-        if others is not None:  # what a bus does is no disturbance of all
-            disturbances = _disturbances(given, others, healthy, layout)
-        converter = None
-        if diagnoser.load_ is None and shared.crosstalk is None:
-            converter = find_converter_change(log, healthy, layout, disturbances)
-        if converter is not None:
-            seen = converter.of(healthy)
-            behind = SelfDiagnosis(**diagnoser.get_params()).fit(seen, progress=progress)
-            again = _judged(log, seen, behind, disturbed=told)
-            if len(again[0].diagnosis.fault_set) <= len(readings.diagnosis.fault_set):
-                (readings, common), diagnoser, healthy = again, behind, seen
-                amplified = converter.gain
-    if common is not None:
-        disturbances.append(common.disturbance)
-    change = None
-    if max(amplified, 1 / amplified) >= GAIN:
-        change = amplification(amplified, len(log))
-    elif shared.crosstalk is None:
-        change = _change(_with_offset(readings, common, log), healthy, diagnoser, disturbances)
-    if change is not None:  # measures it
-        disturbances = [one for one in disturbances if one.name != "offset"]
-    readings = replace(readings, diagnosis=shared.told(readings.diagnosis))
+        told = _compared(given, log, healthy, diagnoser, disturbances, crosstalk, progress)
+    if told.common is not None:
+        told.disturbances.append(told.common.disturbance)
+    if told.change is not None:  # measures it
+        told.disturbances = [one for one in told.disturbances if one.name != "offset"]
+    readings = replace(told.readings, diagnosis=shared.told(told.readings.diagnosis))
     findings = [
         *_of_readings(readings),
-        *(_finding(one) for one in disturbances),
-        *_of_change(change),
+        *(_finding(one) for one in told.disturbances),
+        *_of_change(told.change),
         *of_diagnosis(readings.diagnosis),
     ]
     if classes is not None:
         findings += [
             finding_of("coincides", text) for text in coinciding(readings.diagnosis, classes)
         ]
-    return Inspection(readings, tuple(findings), change, common)
+    return Inspection(readings, tuple(findings), told.change, told.common)
+
+
+def _usable(
+    reference: ArrayLike | Sequence[ArrayLike], layout: SensorLayout
+) -> list[NDArray[np.float64]]:
+    """Return the recordings of a reference as :func:`inspect` compares them."""
+    usable = RecordingBlocks(measured(checked_recordings(reference, layout), layout))
+    return [within_range(frames, layout)[0] for frames in usable]
+
+
+@dataclass
+class _Told:
+    """What is told of a log, but for its cells and wires.
+
+    Attributes:
+        readings: with what changed between cells and readings.
+        common: the common mode that they do without.
+        disturbances: of the array.
+        change: of a pad or of the sensor.
+    """
+
+    readings: ChangedReadings
+    common: CommonMode | None
+    disturbances: list[Disturbance]
+    change: SensorChange | None = None
+
+
+def _compared(
+    given: list[NDArray[np.float64]],
+    log: list[NDArray[np.float64]],
+    healthy: list[NDArray[np.float64]],
+    diagnoser: SelfDiagnosis,
+    disturbances: list[Disturbance],
+    crosstalk: bool,
+    progress: Callable[[float], None],
+) -> _Told:
+    """Return what is told of a log beside the reference that the diagnosis is fitted to.
+
+    Args:
+        given, log, healthy, disturbances: as for :func:`_disturbances`, and what it returned.
+        crosstalk: the lines of the log have it, which the cells of a pad share, too.
+        progress: of a fit to the reference as a changed converter would read it.
+    """
+    layout = diagnoser.layout
+    disturbed = crosstalk or any(one.name in _OF_ALL_CELLS for one in disturbances)
+    compared = [] if crosstalk else healthy
+    told = _Told(*_judged(log, compared, diagnoser, disturbed=disturbed), disturbances)
+    others = _without_groups(log, told.readings.diagnosis)
+    if others is not None:  # what a bus does is no disturbance of all
+        told.disturbances = _disturbances(given, others, healthy, layout)
+    if crosstalk:
+        return told
+    converter = None
+    if diagnoser.load_ is None:
+        converter = find_converter_change(log, healthy, layout, told.disturbances)
+    if converter is not None:
+        seen = converter.of(healthy)
+        behind = SelfDiagnosis(**diagnoser.get_params()).fit(seen, progress=progress)
+        readings, common = _judged(log, seen, behind, disturbed=disturbed)
+        if len(readings.diagnosis.fault_set) <= len(told.readings.diagnosis.fault_set):
+            told.readings = readings
+            told.common = common
+            diagnoser = behind
+            healthy = seen
+            if max(converter.gain, 1 / converter.gain) >= GAIN:
+                told.change = amplification(converter.gain, len(log))
+                return told
+    shifted = [*told.disturbances]
+    if told.common is not None:
+        shifted.append(told.common.disturbance)
+    left_in = _with_offset(told.readings, told.common, log)
+    told.change = _change(left_in, healthy, diagnoser, shifted)
+    return told
 
 
 def _disturbances(

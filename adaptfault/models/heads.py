@@ -207,18 +207,11 @@ def fit_head(
     known = _known(both._replace(moments=both.moments / units))
     of_windows = Kernels(known, values=values)
     on = known.moments.device
-    all_weights = []
-    all_held = []
-    for joint in (True, False):
-        weights, found = _regression(of_windows.upper(joint=joint), task, folds)
-        scale, outputs = task.outputs(found)
-        all_weights.append(weights * scale.to(on))
-        all_held.append(outputs)
+    weights, all_held = _regressions(of_windows, task, folds)
     shares = task.shares(all_held)
-    mixed = mixture(all_held, shares, values=values)
+    outputs = mixed = mixture(all_held, shares, values=values)
     trees = Forest.blank(task.targets.shape[1])
     pooling = torch.tensor([1.0, 0.0])
-    outputs = mixed
     if forest:
         course = both.course.cpu().numpy()
         trees, grown = task.said(*fit_forest(course, task.targets.numpy(), folds, values=values))
@@ -227,7 +220,7 @@ def fit_head(
     head = Head(
         known,
         of_windows.widths,
-        torch.stack(all_weights),
+        weights,
         task.bias.to(on),
         shares.to(on),
         trees.to(on),
@@ -241,6 +234,21 @@ def fit_head(
 
 def _known(views: Views) -> Known:
     return Known(views.features, views.smooth, views.moments)
+
+
+def _regressions(
+    of_windows: Kernels, task: Classes | Values, folds: NDArray[np.int64]
+) -> tuple[Tensor, list[Tensor]]:
+    """Return the weights ``[kernels, M, k]`` of the regressions, and the held-out outputs of
+    each."""
+    all_weights = []
+    all_held = []
+    for joint in (True, False):
+        weights, found = _regression(of_windows.upper(joint=joint), task, folds)
+        scale, outputs = task.outputs(found)
+        all_weights.append(weights * scale.to(weights.device))
+        all_held.append(outputs)
+    return torch.stack(all_weights), all_held
 
 
 def _regression(

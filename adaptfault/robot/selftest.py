@@ -76,23 +76,9 @@ def plan_selftest(
         layout.check_recording(recording, f"recording {i}")
         for i, recording in enumerate(layout.recordings(list(repertoire)))
     ]
-    if len(frames) < 2:
-        raise ValueError(
-            f"a repertoire has at least 2 recordings to choose from, got {len(frames)}"
-        )
-    labels = repertoire.labels if isinstance(repertoire, Recordings) else None
-    names = (
-        repertoire.names
-        if isinstance(repertoire, Recordings)
-        else tuple(f"recording {i}" for i in range(len(frames)))
-    )
-    loaded = loads(frames, layout)
-    if not loaded.any():
-        raise ValueError("no recording of the repertoire loads any cell: record contacts")
     durations = np.array([len(one) / layout.rate for one in frames])
     weights = cell_weights(adapter, faulty)
-    gestures = np.zeros(len(frames), np.int64) if labels is None else np.asarray(labels)
-    every = Repertoire.from_loads(loaded, gestures, tuple(names), weights)
+    every = _every(repertoire, frames, layout, weights)
     begun = np.zeros(layout.n_cells, bool) if tested is None else tested
     chosen, reached = greedy(every.likely, weights, durations, begun, seconds, n)
     if not chosen:
@@ -105,12 +91,35 @@ def plan_selftest(
     before = float(weights[begun].sum())
     return Routine(
         tuple(chosen),
-        tuple(names[i] for i in chosen),
+        tuple(every.names[i] for i in chosen),
         (before, reached[-1]),
         tuple(reached),
         float(durations[chosen].sum()),
         every,
     )
+
+
+def _every(
+    repertoire: Recordings | Sequence[NDArray[Any]],
+    frames: Sequence[Floats],
+    layout: SensorLayout,
+    weights: Floats,
+) -> Repertoire:
+    """Return what there is to choose from; ``frames``: of the repertoire, as they are checked."""
+    if len(frames) < 2:
+        raise ValueError(
+            f"a repertoire has at least 2 recordings to choose from, got {len(frames)}"
+        )
+    loaded = loads(frames, layout)
+    if not loaded.any():
+        raise ValueError("no recording of the repertoire loads any cell: record contacts")
+    names = tuple(f"recording {i}" for i in range(len(frames)))
+    gestures = np.zeros(len(frames), np.int64)
+    if isinstance(repertoire, Recordings):
+        names = tuple(repertoire.names)
+        if repertoire.labels is not None:
+            gestures = np.asarray(repertoire.labels)
+    return Repertoire.from_loads(loaded, gestures, names, weights)
 
 
 def loads(frames: Sequence[Floats], layout: SensorLayout) -> NDArray[np.bool_]:

@@ -54,23 +54,13 @@ def write_report(
         OSError: the file cannot be written.
     """
     runs = bundle.journal.runs()
-    if diagnosis is None and run is not None:
-        diagnosis = run.diagnosis
-    if diagnosis is None:
-        diagnosed = [one["diagnosis"] for one in runs if one.get("diagnosis")]
-        diagnosis = Diagnosis.from_dict(diagnosed[-1]) if diagnosed else None
+    diagnosis = diagnosis or _last_diagnosis(run, runs)
     state = SensorState.of(bundle)
     problems = bundle.problems(repair=False)
     if run is not None:
         state = _state_after(run, bundle, state)
-    headline = _HEADLINES[state.exit_code]
-    if state.exit_code == 1 and not state.known.faults:
-        headline = "Watch: no fault is known, but see the reason"
-    if state.exit_code == 0 and problems:
-        headline = "Watch: files of the bundle are damaged"
-    unhandled = by_group(
-        [fault for fault in state.known.faults if fault in state.unhandled], bundle.layout
-    )
+    used = [fault for fault in state.known.faults if fault in state.unhandled]
+    unhandled = by_group(used, bundle.layout)
     recalls = [] if run is not None and run.dry_run else list(bundle.class_recalls())
     recalls.sort(key=lambda one: one.low)
     handled = [fault for fault in state.known.faults if fault not in state.unhandled]
@@ -78,7 +68,7 @@ def write_report(
         path,
         "robot/technician.html",
         name=name or robot_name(bundle.path),
-        headline=headline,
+        headline=_headline(state, problems),
         bad=state.exit_code >= 2,
         bundle=bundle,
         layout=bundle.layout,
@@ -96,16 +86,28 @@ def write_report(
         selftest=None if run is None else run.selftest,
         diagnosis=diagnosis,
         numbering=Numbering.from_layout(bundle.layout, count_from),
-        verdicts=(
-            None
-            if diagnosis is None
-            else Picture.of(partial(diagnosis.plot, count_from=count_from))
-        ),
+        verdicts=diagnosis and Picture.of(partial(diagnosis.plot, count_from=count_from)),
         dry_run=run is not None and run.dry_run,
         runs=[_shown(one) for one in reversed(runs)],
         problems=problems,
         date=datetime.now().astimezone().strftime("%Y-%m-%d %H:%M %Z"),
     )
+
+
+def _last_diagnosis(run: MaintenanceReport | None, runs: list[dict[str, Any]]) -> Diagnosis | None:
+    """Return the diagnosis of a run, or the last one of the runs in the journal."""
+    if run is not None and run.diagnosis is not None:
+        return run.diagnosis
+    diagnosed = [one["diagnosis"] for one in runs if one.get("diagnosis")]
+    return Diagnosis.from_dict(diagnosed[-1]) if diagnosed else None
+
+
+def _headline(state: SensorState, problems: list[str]) -> str:
+    if state.exit_code == 1 and not state.known.faults:
+        return "Watch: no fault is known, but see the reason"
+    if state.exit_code == 0 and problems:
+        return "Watch: files of the bundle are damaged"
+    return _HEADLINES[state.exit_code]
 
 
 def robot_name(bundle: Path) -> str:

@@ -185,7 +185,7 @@ def test_killed_and_started_again_gives_the_same_file(place, monkeypatch):
     assert without_seconds("sub.json") == without_seconds("whole.json")
 
 
-def test_our_own_methods_enter_by_the_same_door(place, roughly_fitted, monkeypatch):
+def test_our_own_methods_enter_by_the_same_door(place, monkeypatch):
     monkeypatch.setattr(f"{OURS}.EPOCHS", 1)
     assert run(f"{OURS}:Cold", "cold.json") == 0
     assert run(f"{OURS}:Fitted", "fitted.json") == 0

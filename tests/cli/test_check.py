@@ -19,8 +19,6 @@ from diagnostics import Fault, SelfDiagnosis, SensorLayout, inject
 
 LAYOUT = SensorLayout(1, 3, 4, full_scale=1.0, unit="V", rate=50.0)
 
-pytestmark = pytest.mark.usefixtures("roughly_fitted")
-
 
 def contacts(n: int = 8, seed: int = 0) -> list[np.ndarray]:
     """Recordings that begin and end without contact."""

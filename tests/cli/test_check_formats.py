@@ -19,8 +19,6 @@ from diagnostics import Fault, SensorLayout, inject
 LAYOUT = SensorLayout(1, 3, 4, full_scale=1.0, unit="V", rate=50.0)
 HOOKS = Path(__file__).parents[2] / ".pre-commit-hooks.yaml"
 
-pytestmark = pytest.mark.usefixtures("roughly_fitted")
-
 
 @pytest.fixture
 def data_set(tmp_path):

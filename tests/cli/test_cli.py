@@ -56,7 +56,6 @@ def write_csv(path: Path, frames: np.ndarray) -> None:
     np.savetxt(path, frames, delimiter=",", fmt="%.4f")
 
 
-@pytest.mark.usefixtures("roughly_fitted")
 def test_a_broken_row_is_diagnosed_adapted_to_and_the_repair_measured(home, small, capsys):
     broken = line_fault(SMALL, Line(1, "row", 2), "short")
     log = small.select([i for i in range(len(small)) if small.labels[i] > 0][:12])
@@ -144,6 +143,7 @@ def test_the_demo_runs_on_the_users_recordings_and_writes_a_report_that_needs_no
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("fitted_anew")
 def test_training_again_gives_the_same_model(home, tmp_path):
     for name in ("first", "again"):
         command = [
@@ -614,9 +614,8 @@ def test_exchanged_rows_that_the_version_undoes_are_put_back_in_a_log_too_large_
     )
 
 
-@pytest.mark.usefixtures("roughly_fitted")
 def test_diagnose_tells_of_a_change_of_the_whole_sensor(
-    made_bundle, small, later_grasps, roughly_fitted, tmp_path, capsys
+    made_bundle, small, later_grasps, tmp_path, capsys
 ):
     save_npz(tmp_path / "healthy.npz", small)
     for reference, gain in (

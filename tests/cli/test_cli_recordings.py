@@ -167,7 +167,6 @@ def test_what_is_inferred_is_printed_once_and_what_is_stated_is_not(tmp_path, ca
     ) == (3, True, True)
 
 
-@pytest.mark.usefixtures("roughly_fitted")
 def test_the_log_is_read_in_the_layout_of_its_reference(file, skin, tmp_path, capsys):
     log = tmp_path / "log.npy"
     np.save(log, np.stack(skin.frames).reshape(9, 24, 6, 5))
@@ -182,7 +181,6 @@ def test_the_log_is_read_in_the_layout_of_its_reference(file, skin, tmp_path, ca
     assert (code, "full scale 4095 count where 3.3 V is expected" in said) == (3, True)
 
 
-@pytest.mark.usefixtures("roughly_fitted")
 def test_diagnose_writes_a_page_with_the_verdict_first(file, tmp_path, capsys):
     broken = tmp_path / "broken.npz"
     run(capsys, "convert", file, "--take", "3:", "--inject", "row:0:3=short", "--out", broken)

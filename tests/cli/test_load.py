@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from conftest import rough_fit, without_export
+from conftest import without_export
 
 from adaptfault.acquisition.switch import parse_when
 from adaptfault.cli import main
@@ -51,14 +51,12 @@ def log(later_grasps: list[np.ndarray], small_grasps: Recordings) -> list[np.nda
 
 @pytest.fixture(scope="module")
 def low(healthy: list[np.ndarray], small_grasps: Recordings) -> SelfDiagnosis:
-    with rough_fit():
-        return SelfDiagnosis(replace(small_grasps.layout, rest="low")).fit(healthy)
+    return SelfDiagnosis(replace(small_grasps.layout, rest="low")).fit(healthy)
 
 
 @pytest.fixture(scope="module")
 def high(healthy: list[np.ndarray], small_grasps: Recordings) -> SelfDiagnosis:
-    with rough_fit():
-        return SelfDiagnosis(replace(small_grasps.layout, rest="high")).fit(turned(healthy))
+    return SelfDiagnosis(replace(small_grasps.layout, rest="high")).fit(turned(healthy))
 
 
 def same(one: Diagnosis, other: Diagnosis) -> bool:
@@ -261,8 +259,7 @@ def test_a_cell_that_holds_a_count_is_told_with_the_count_that_it_reads_mostly(
         loads = np.rint(np.asarray(frames, np.float64) / FULL * most)
         return most - loads if rest == "high" else loads
 
-    with rough_fit():
-        fitted = SelfDiagnosis(layout).fit([counts(frames) for frames in healthy])
+    fitted = SelfDiagnosis(layout).fit([counts(frames) for frames in healthy])
     log = counts(np.concatenate(later_grasps))
     log[:, 27] = 40
     log[:3, 27] = 37

@@ -54,7 +54,6 @@ def test_many_impossible_readings_blame_no_other_cell(fitted: SelfDiagnosis, log
     assert set(fitted.diagnose(seen).fault_set) <= {57, 163}
 
 
-@pytest.mark.usefixtures("roughly_fitted")
 def test_a_reference_with_impossible_readings_is_fitted_as_one_with_missing_readings(
     small_grasps: Recordings,
 ):
@@ -85,7 +84,6 @@ def read_there(frames: np.ndarray, layout: SensorLayout, what: str) -> np.ndarra
     return seen
 
 
-@pytest.mark.usefixtures("roughly_fitted")
 @pytest.mark.parametrize("what", ["a copy of all", "noise", "too much"])
 def test_what_a_position_without_a_cell_reads_changes_nothing(what: str):
     present = np.ones((1, 6, 7), bool)

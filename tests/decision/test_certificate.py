@@ -54,14 +54,12 @@ def test_every_log_is_judged_once_by_a_fit_without_it():
     assert certify(given, excluded, blamed).n_alarms == 0
 
 
-@pytest.mark.usefixtures("roughly_fitted")
 def test_too_few_recordings_give_none():
     assert certify(recordings(FEWEST_LOGS * LOG - 1), NONE, lambda rest, logs: []) is None
     assert SelfDiagnosis(LAYOUT).certificate_ is None
     assert SelfDiagnosis(LAYOUT).fit(recordings(12)).certificate_ is None
 
 
-@pytest.mark.usefixtures("roughly_fitted")
 def test_a_fit_certifies_itself_and_the_file_keeps_it(tmp_path):
     fitted = SelfDiagnosis(LAYOUT).fit(recordings(24))
     certificate = fitted.certificate_
@@ -73,13 +71,11 @@ def test_a_fit_certifies_itself_and_the_file_keeps_it(tmp_path):
     assert fitted.set_params(false_discovery_rate=0.01).certificate_ is None
 
 
-@pytest.mark.usefixtures("roughly_fitted")
 def test_a_cell_that_is_dead_in_the_reference_is_no_false_alarm():
     dead = [inject(one, [Fault("short", (5,))], LAYOUT) for one in recordings(24)]
     assert SelfDiagnosis(LAYOUT).fit(dead).certificate_.n_alarms == 0
 
 
-@pytest.mark.usefixtures("roughly_fitted")
 def test_copies_in_the_reference_make_no_certificate_better():
     originals = recordings(8)
     fitted = SelfDiagnosis(LAYOUT).fit([*originals, *(one[1:] for one in originals * 4)])

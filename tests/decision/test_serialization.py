@@ -87,7 +87,9 @@ def test_masked_positions_and_arrays_in_tiles_come_back():
     assert restored.diagnose(frames).to_dict() == diagnoser.diagnose(frames).to_dict()
 
 
-def test_arrays_are_fitted_in_the_memory_order_in_which_they_come_back(small):
+@pytest.mark.usefixtures("fitted_anew")
+def test_arrays_are_fitted_in_the_memory_order_in_which_they_come_back():
+    small = small_fit(SensorLayout(1, 3, 3))
     for diagnoser in (small, stored(small)):
         (regression,) = diagnoser.reference_.model.local_regressions
         assert all(

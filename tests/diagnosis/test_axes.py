@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from conftest import rough_fit
 
 from diagnostics import Diagnosis, FaultKind, Line, Monitor, SelfDiagnosis, SensorLayout, StaticLoad
 
@@ -35,8 +34,7 @@ def recordings(count: int, seed: int) -> list[np.ndarray]:
 
 @pytest.fixture(scope="module")
 def fitted() -> SelfDiagnosis:
-    with rough_fit():
-        return SelfDiagnosis(TAXELS).fit(recordings(40, 0))
+    return SelfDiagnosis(TAXELS).fit(recordings(40, 0))
 
 
 def test_the_axis_runs_last_and_each_position_is_a_wire():

@@ -22,7 +22,6 @@ ROW = [LAYOUT.cell(0, 3, column) for column in range(8)]
 STUCK = LAYOUT.cell(0, 5, 4)
 DEAD = sorted([*ROW, STUCK])
 MIDDLE = tuple(range(14, 28))
-pytestmark = pytest.mark.usefixtures("roughly_fitted")
 
 
 @pytest.fixture(scope="module")
@@ -44,10 +43,7 @@ def seated_again(grasps: list[np.ndarray]) -> list[np.ndarray]:
 
 @pytest.fixture(scope="module")
 def diagnosis(seated_again: list[np.ndarray]) -> Diagnosis:
-    from conftest import rough_fit
-
-    with rough_fit():
-        return SelfDiagnosis(LAYOUT).diagnose(seated_again)
+    return SelfDiagnosis(LAYOUT).diagnose(seated_again)
 
 
 def test_what_is_dead_for_some_recordings_and_works_again_is_found_with_them(diagnosis):

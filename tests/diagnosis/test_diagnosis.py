@@ -449,7 +449,6 @@ def test_positions_without_a_cell_have_no_verdict():
         assert not np.isin(diagnosis.coverage.untested, masked).any()
 
 
-@pytest.mark.usefixtures("roughly_fitted")
 def test_cells_that_no_reference_contact_loaded_and_now_hold_a_load_are_found(
     small_grasps: Recordings,
 ):
@@ -472,7 +471,6 @@ def test_cells_that_no_reference_contact_loaded_and_now_hold_a_load_are_found(
     assert fitted.diagnose(unreached(log, corner, 5.0)).fault_set == set(corner)
 
 
-@pytest.mark.usefixtures("roughly_fitted")
 def test_a_single_recording_and_one_of_another_unit_will_do():
     layout = SensorLayout(1, 4, 4, full_scale=4095, unit="count", rate=50)
     rng = np.random.default_rng(0)
@@ -509,7 +507,6 @@ def test_readings_that_are_missing_here_and_there_are_no_fault(
     assert not (COLD if cold else fitted).diagnose(gappy(log, share)).faults
 
 
-@pytest.mark.usefixtures("roughly_fitted")
 def test_faults_are_found_with_a_reference_that_misses_many_readings(small_grasps: Recordings):
     layout = small_grasps.layout
     log = small_grasps.frames[31::3]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from conftest import rough_fit
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -44,8 +43,7 @@ def recordings(n: int, seed: int) -> list[np.ndarray]:
 
 @pytest.fixture(scope="module")
 def fitted() -> SelfDiagnosis:
-    with rough_fit():
-        return SelfDiagnosis(LAYOUT).fit(recordings(60, 1))
+    return SelfDiagnosis(LAYOUT).fit(recordings(60, 1))
 
 
 def failing(way: str, readings: np.ndarray, rng: np.random.Generator) -> np.ndarray:

@@ -43,7 +43,6 @@ def failing(grasps: list[np.ndarray], cells: list[int], since: int) -> list[np.n
     return [*grasps[:since], *after]
 
 
-@pytest.mark.usefixtures("roughly_fitted")
 def test_cells_that_fail_in_the_second_half_are_found_without_a_reference(grasps):
     dead = [18, 27, 44]
     diagnosis = SelfDiagnosis(LAYOUT).diagnose(failing(grasps, dead, FAILS))
@@ -52,7 +51,6 @@ def test_cells_that_fail_in_the_second_half_are_found_without_a_reference(grasps
     assert all(abs(fault.onset - start) < 300 for fault in diagnosis.faults)
 
 
-@pytest.mark.usefixtures("roughly_fitted")
 def test_cells_that_are_dead_from_the_start_are_found_too(grasps):
     dead = [9, 36]
     diagnosis = SelfDiagnosis(LAYOUT).diagnose(failing(grasps, dead, 0))
@@ -93,7 +91,6 @@ def test_a_fitted_diagnosis_stays_what_it_is(grasps, own):
     assert own.for_log(grasps) is own
 
 
-@pytest.mark.usefixtures("roughly_fitted")
 def test_the_diagnosis_itself_is_not_fitted_by_a_log(grasps):
     cold = SelfDiagnosis(LAYOUT)
     cold.diagnose(grasps)
@@ -113,7 +110,6 @@ def test_noise_before_the_first_contact_is_no_reference(grasps):
     assert cold.for_log([*idle, *grasps[20:]]) is cold
 
 
-@pytest.mark.usefixtures("roughly_fitted")
 def test_a_log_with_missing_readings_is_its_own_reference(grasps):
     rng = np.random.default_rng(0)
     gappy = [np.where(rng.random(recording.shape) < 0.2, np.nan, recording) for recording in grasps]
@@ -137,7 +133,6 @@ def test_a_log_without_any_reading_is_refused():
         SelfDiagnosis(LAYOUT).diagnose([np.full((20, 64), np.nan)] * 40)
 
 
-@pytest.mark.usefixtures("roughly_fitted")
 def test_a_cell_that_never_delivers_a_reading_is_faulty_and_does_not_disturb_the_fit(grasps):
     silent = [np.where(np.arange(64) == 30, np.nan, recording) for recording in grasps]
     assert SelfDiagnosis(LAYOUT).diagnose(silent).fault_set == {30}
@@ -155,7 +150,6 @@ def test_a_cell_at_full_scale_on_a_pad_that_nothing_touched_is_short_without_a_r
     assert {fault.kind for fault in diagnosis.faults} == {FaultKind.SHORT}
 
 
-@pytest.mark.usefixtures("roughly_fitted")
 @pytest.mark.parametrize("recordings", [slice(None), slice(8)], ids=["own reference", "short"])
 def test_a_cell_that_is_worn_from_the_start_is_not_told_alive_without_a_reference(
     grasps, recordings: slice

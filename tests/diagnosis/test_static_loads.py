@@ -2,7 +2,6 @@ from collections.abc import Sequence
 
 import numpy as np
 import pytest
-from conftest import rough_fit
 
 from adaptfault.data.recordings import Recordings
 from diagnostics import (
@@ -68,7 +67,6 @@ def test_an_object_that_lies_still_is_told_and_no_cell_is_blamed(
     assert Diagnosis.from_dict(found.to_dict()).static_loads == found.static_loads
 
 
-@pytest.mark.usefixtures("roughly_fitted")
 def test_cells_that_hold_the_loads_of_an_object_without_their_noise_are_stuck(
     small_grasps: Recordings,
 ):
@@ -142,8 +140,7 @@ def sagging(seed: int, recordings: int, idle: int = 0) -> list[np.ndarray]:
 
 @pytest.fixture(scope="module")
 def of_pads() -> SelfDiagnosis:
-    with rough_fit():
-        return SelfDiagnosis(PADS).fit(sagging(1, 40))
+    return SelfDiagnosis(PADS).fit(sagging(1, 40))
 
 
 @pytest.mark.parametrize("seed", range(2, 8))

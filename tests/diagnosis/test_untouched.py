@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from conftest import rough_fit
 from contact_recordings import events
 
 from diagnostics import Fault, FaultKind, Monitor, SelfDiagnosis, SensorLayout, inject
@@ -25,7 +24,6 @@ def noisy_presses(
     return [np.clip(np.round(r / STEP), 0, 1023) * STEP for r in read]
 
 
-@pytest.mark.usefixtures("roughly_fitted")
 def test_cells_that_have_all_sunk_some_of_them_to_the_rail_are_not_suspected():
     rng = np.random.default_rng(4)
     rests = np.linspace(0.004, 0.04, CELLS)
@@ -41,7 +39,6 @@ def test_cells_that_have_all_sunk_some_of_them_to_the_rail_are_not_suspected():
     assert not fitted.diagnose(read(1, 6, sunk=0.015)).fault_set
 
 
-@pytest.mark.usefixtures("roughly_fitted")
 def test_dead_cells_without_contact_are_found_by_their_lack_of_noise_in_the_monitor_too():
     fitted = SelfDiagnosis(LAYOUT).fit(noisy_presses(0))
     log = noisy_presses(1, 4)
@@ -79,8 +76,7 @@ def rests(rng: np.random.Generator) -> tuple[float, float]:
 def of_pads() -> SelfDiagnosis:
     rng = np.random.default_rng(0)
     healthy = [recording(rng, (0.25, 0.0)), *(recording(rng, rests(rng)) for _ in range(59))]
-    with rough_fit():
-        return SelfDiagnosis(PADS).fit(healthy)
+    return SelfDiagnosis(PADS).fit(healthy)
 
 
 def opened(rest: tuple[float, float], cells: list[int]) -> np.ndarray:

@@ -2,7 +2,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from conftest import rough_fit
 
 from adaptfault.data.simulated_grasps import simulate
 from adaptfault.robot.ros_diagnostics import diagnostic_array, stale_array
@@ -181,8 +180,7 @@ def grasps() -> list[np.ndarray]:
 
 @pytest.fixture(scope="module")
 def fitted(grasps: list[np.ndarray]) -> SelfDiagnosis:
-    with rough_fit():
-        return SelfDiagnosis(WIRED).fit(grasps[::2])
+    return SelfDiagnosis(WIRED).fit(grasps[::2])
 
 
 def silenced(log: list[np.ndarray], cells: object, value: float = np.nan) -> list[np.ndarray]:

@@ -55,6 +55,7 @@ def test_each_sign_of_a_failed_training_is_named_with_likely_causes(confusion, h
     assert expected in problems[0]
 
 
+@pytest.mark.usefixtures("all_trees")
 @pytest.mark.parametrize("drift", [0.0, 5.0])
 def test_rest_levels_that_tell_the_class_raise_a_question(drift):
     rng = np.random.default_rng(0)

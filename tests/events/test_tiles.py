@@ -2,7 +2,6 @@ import tracemalloc
 
 import numpy as np
 import pytest
-from conftest import rough_fit
 
 from diagnostics import (
     Fault,
@@ -52,8 +51,7 @@ def log(
 
 @pytest.fixture(scope="module")
 def fitted() -> SelfDiagnosis:
-    with rough_fit():
-        return SelfDiagnosis(SKIN).fit([log(SKIN, 199, seed) for seed in range(7)])
+    return SelfDiagnosis(SKIN).fit([log(SKIN, 199, seed) for seed in range(7)])
 
 
 def test_each_cell_is_an_output_of_one_tile_with_all_cells_near_it_on_its_pad_as_inputs():

@@ -2,7 +2,6 @@ from functools import cache
 
 import numpy as np
 import pytest
-from conftest import rough_fit
 from contact_recordings import CELLS, LAYOUT, events
 
 from diagnostics import Fault, FaultKind, SelfDiagnosis, Verdict, inject
@@ -101,8 +100,7 @@ def test_two_frames_give_no_noise_estimate():
 
 @cache
 def fitted_to(sigma: float, rest: float) -> SelfDiagnosis:
-    with rough_fit():
-        return SelfDiagnosis(LAYOUT).fit(noisy(events(0), sigma, rest))
+    return SelfDiagnosis(LAYOUT).fit(noisy(events(0), sigma, rest))
 
 
 @pytest.mark.parametrize(("sigma", "rest"), [(0.0, 0.08), (0.01, 0.1)])

@@ -112,14 +112,18 @@ def test_two_workers_report_what_one_does(fleet, sequential, tmp_path):
     assert told(parallel) == told(sequential)
 
 
-def test_a_robot_that_is_being_maintained_is_waited_for(fleet, monkeypatch):
-    held = Bundle.open(fleet.robots[0].bundle).maintenance()
+def test_a_robot_that_is_being_maintained_is_waited_for(fleet, tmp_path, monkeypatch):
+    robot = replace(fleet.robots[0], bundle=str(tmp_path / "robot.bundle"))
+    shutil.copytree(fleet.robots[0].bundle, robot.bundle)
+    held = Bundle.open(robot.bundle).maintenance()
     held.__enter__()
-    threading.Timer(0.3, held.__exit__, (None, None, None)).start()
-    assert maintain_robot(fleet.robots[0], dry_run=True).decision == "unchanged"
-    with Bundle.open(fleet.robots[0].bundle).maintenance():
+    timer = threading.Timer(0.3, held.__exit__, (None, None, None))
+    timer.start()
+    assert maintain_robot(robot).decision == "unchanged"
+    timer.join()
+    with Bundle.open(robot.bundle).maintenance():
         monkeypatch.setattr(working, "_PATIENCE", 0)
-        outcome = maintain_robot(fleet.robots[0])
+        outcome = maintain_robot(robot)
     assert outcome.decision == "error"
     assert "being maintained by another process" in outcome.reason
 

@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from conftest import rough_fit
 
 from adaptfault.data.simulated_grasps import simulate
 from diagnostics import Diagnosis, Fault, FaultKind, SelfDiagnosis, SensorLayout, Verdict, inject
@@ -37,8 +36,7 @@ def worn() -> list[np.ndarray]:
 
 @pytest.fixture(scope="module")
 def fitted(worn: list[np.ndarray]) -> SelfDiagnosis:
-    with rough_fit():
-        return SelfDiagnosis(LAYOUT).fit(worn[::2])
+    return SelfDiagnosis(LAYOUT).fit(worn[::2])
 
 
 def test_cells_that_are_dead_throughout_are_found_and_no_other(worn):

@@ -4,7 +4,6 @@ import json
 
 import numpy as np
 import pytest
-from conftest import rough_fit
 from safetensors.numpy import load, save
 
 from adaptfault.data.simulated_grasps import simulate
@@ -31,8 +30,7 @@ def grasps(n: int, seed: int) -> list[np.ndarray]:
 
 @pytest.fixture(scope="module")
 def fitted() -> SelfDiagnosis:
-    with rough_fit():
-        return SelfDiagnosis(SKIN).fit(grasps(8, 0))
+    return SelfDiagnosis(SKIN).fit(grasps(8, 0))
 
 
 @pytest.fixture(scope="module")

@@ -14,8 +14,6 @@ from diagnostics import Diagnosis, Fault, SensorLayout, Verdict
 LAYOUT = SensorLayout(1, 3, 4, full_scale=1.0, unit="V", rate=50.0)
 NAMES = ("a", "b", "c", "d")
 
-pytestmark = pytest.mark.usefixtures("roughly_fitted")
-
 
 def diagnosis(shown: list[int]) -> Diagnosis:
     """Return a diagnosis in which cell 5 is faulty in some of four recordings."""

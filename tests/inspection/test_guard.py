@@ -11,8 +11,6 @@ from diagnostics import Fault, SensorLayout, inject, line_fault
 
 LAYOUT = SensorLayout(1, 3, 4, full_scale=1.0, unit="V", rate=50.0)
 
-pytestmark = pytest.mark.usefixtures("roughly_fitted")
-
 
 def recordings(*faults: Fault, n: int = 16) -> Recordings:
     rng = np.random.default_rng(0)

@@ -17,7 +17,6 @@ from diagnostics import Fault, SelfDiagnosis, SensorLayout, inject
 LAYOUT = SensorLayout(1, 6, 6, full_scale=3.3, unit="V", rate=20.0)
 
 pytestmark = [
-    pytest.mark.usefixtures("roughly_fitted"),
     pytest.mark.filterwarnings("ignore:touch readings"),  # of the guard
 ]
 

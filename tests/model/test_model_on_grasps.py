@@ -4,7 +4,6 @@ from collections.abc import Sequence
 
 import numpy as np
 import pytest
-from conftest import rough_fit
 
 from adaptfault.data.recordings import Recordings
 from diagnostics import (
@@ -27,8 +26,7 @@ def layout(small_grasps: Recordings) -> SensorLayout:
 
 @pytest.fixture(scope="module")
 def fitted(small_grasps: Recordings) -> SelfDiagnosis:
-    with rough_fit():
-        return SelfDiagnosis(small_grasps.layout).fit(small_grasps.frames[::2])
+    return SelfDiagnosis(small_grasps.layout).fit(small_grasps.frames[::2])
 
 
 @pytest.fixture(scope="module")
@@ -111,8 +109,7 @@ def test_a_cell_that_no_longer_comes_to_rest_is_found(fitted, log, often, layout
 def test_a_cell_that_was_dead_in_the_reference_is_faulty_until_it_moves(small_grasps, log, layout):
     cell = 22
     dead = [np.where(np.arange(layout.n_cells) == cell, 2.0, r) for r in small_grasps.frames[::2]]
-    with rough_fit():
-        fitted = SelfDiagnosis(layout).fit(dead)
+    fitted = SelfDiagnosis(layout).fit(dead)
     stuck = [np.where(np.arange(layout.n_cells) == cell, 2.0, r) for r in log]
     assert told(fitted.diagnose(stuck)) == [(FaultKind.STUCK, None, (cell,))]
     assert told(fitted.diagnose(log)) == []

@@ -88,8 +88,8 @@ def test_what_the_file_states_changes_no_prediction_and_the_file_comes_out_twice
     versions, small_graph, monkeypatch
 ):
     onnx = pytest.importorskip("onnx")
-    data = (versions["head"] / "model.onnx").read_bytes()
-    model = Adaptation.load(versions["head"]).model
+    data = (versions["whole"] / "model.onnx").read_bytes()
+    model = Adaptation.load(versions["whole"]).model
     plain = onnx.load_from_string(data)
     del plain.metadata_props[:]
     x = small_windows(7)

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import DROPPED, SMALL, rough_fit, small_windows
+from conftest import DROPPED, SMALL, small_windows
 
 from adaptfault.bundle.bundle import Bundle
 from adaptfault.bundle.versions import Version
@@ -75,8 +75,7 @@ def presses(seed: int, frames: int = 400) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def fitted_small() -> SelfDiagnosis:
-    with rough_fit():
-        return SelfDiagnosis(SMALL).fit([presses(seed, 100) for seed in range(12)])
+    return SelfDiagnosis(SMALL).fit([presses(seed, 100) for seed in range(12)])
 
 
 @pytest.fixture

@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from conftest import rough_fit
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from round_contacts import presses
@@ -25,8 +24,7 @@ def lifted(
 
 @pytest.fixture(scope="module")
 def fitted() -> SelfDiagnosis:
-    with rough_fit():
-        return SelfDiagnosis(LAYOUT).fit(lifted(presses(0), 1))
+    return SelfDiagnosis(LAYOUT).fit(lifted(presses(0), 1))
 
 
 @settings(max_examples=20, deadline=None)
@@ -86,8 +84,7 @@ def test_exchanged_rows_are_found_at_other_levels(fitted: SelfDiagnosis):
 
 @pytest.fixture(scope="module")
 def uneven() -> SelfDiagnosis:
-    with rough_fit():
-        return SelfDiagnosis(LAYOUT).fit([f * GAIN for f in presses(0)])
+    return SelfDiagnosis(LAYOUT).fit([f * GAIN for f in presses(0)])
 
 
 def turned(quarters: int, transposed: bool) -> np.ndarray:

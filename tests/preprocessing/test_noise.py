@@ -1,6 +1,5 @@
 import numpy as np
 import pytest
-from conftest import rough_fit
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -39,8 +38,7 @@ def untouched(
 
 @pytest.fixture(scope="module")
 def fitted() -> SelfDiagnosis:
-    with rough_fit():
-        return SelfDiagnosis(LAYOUT).fit(touched(0, 0.0005, each=20))
+    return SelfDiagnosis(LAYOUT).fit(touched(0, 0.0005, each=20))
 
 
 @settings(max_examples=50, deadline=None)
@@ -137,6 +135,5 @@ def test_contacts_still_test_cells_where_the_noise_grew_and_nobody_is_blamed(
 
 def test_coarse_converters_are_not_blamed_for_noise_that_grew_fifteenfold():
     layout = SensorLayout(1, 6, 6, full_scale=255, unit="count", rate=20.0)
-    with rough_fit():
-        fitted = SelfDiagnosis(layout).fit(touched(7, 0.0005, layout))
+    fitted = SelfDiagnosis(layout).fit(touched(7, 0.0005, layout))
     assert not fitted.diagnose(touched(8, 0.0075, layout)).fault_set

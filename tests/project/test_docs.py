@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from _pytest.mark import ParameterSet
-from conftest import rough_fit, without_export, write_forces, write_keys
+from conftest import without_export, write_forces, write_keys
 
 import adaptfault as af
 from adaptfault.bundle.bundle import Bundle
@@ -96,7 +96,7 @@ def place(prepared: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> It
     shutil.copytree(prepared, place)
     monkeypatch.chdir(place)
     monkeypatch.setattr(af, "train", partial(af.train, epochs=1, progress=False))
-    with without_export(), rough_fit():
+    with without_export():
         yield place
 
 

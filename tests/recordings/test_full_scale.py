@@ -26,7 +26,6 @@ def check_verdicts(factor: float, small_grasps: Recordings) -> None:
     np.testing.assert_array_equal(first.probability, second.probability)
 
 
-@pytest.mark.usefixtures("roughly_fitted")
 def test_verdicts_are_the_same_with_a_full_scale_stated_too_high(small_grasps: Recordings):
     check_verdicts(10.0, small_grasps)
 

@@ -75,7 +75,6 @@ def test_a_log_of_any_size_is_diagnosed_alike(tmp_path, log, kind, monkeypatch, 
     assert any("pad 1, row 5 is short" in fault["reason"] for fault in said[0]["faults"])
 
 
-@pytest.mark.usefixtures("roughly_fitted")
 def test_a_long_log_is_inspected_part_by_part_with_its_wires_put_back(
     small_grasps, monkeypatch, tmp_path, capsys
 ):

@@ -14,7 +14,7 @@ from adaptfault.data.windows import make_windows, recordings_of, scale
 from adaptfault.inspection.inspection import inspect
 from adaptfault.inspection.severity import Reason
 from adaptfault.prediction.predictor import Predictor
-from adaptfault.robot import maintenance
+from adaptfault.robot import decision
 from adaptfault.robot.maintenance import maintain
 from adaptfault.robot.maintenance_report import MaintenanceReport
 from adaptfault.robot.model_comparison import Judgement
@@ -303,9 +303,9 @@ def test_a_replaced_pad_that_costs_nothing_is_told_and_not_undone(bundle, later_
 
 def test_a_replaced_pad_is_recalibrated_without_labels(bundle, later_grasps, monkeypatch):
     # three classes are told apart by any gains: here they are not
-    judged = maintenance._judged_readings
+    judged = decision._judged_readings
     monkeypatch.setattr(
-        maintenance,
+        decision,
         "_judged_readings",
         lambda *given: replace(judged(*given), running=0.5, gain=0.5, low=0.4, high=0.6),
     )
@@ -372,16 +372,14 @@ def test_a_damaged_version_is_replaced_by_a_new_one(repaired, later_grasps, brok
 
 
 def test_what_was_kept_once_is_not_judged_again(bundle, later_grasps, broken_row, monkeypatch):
-    import adaptfault.robot.maintenance as module
-
     def no_gain(running, candidate, windows):
         return Judgement(running=0.5, candidate=0.5, gain=0.0, low=-0.1, high=0.1, collapsed=())
 
-    monkeypatch.setattr(module, "compare_candidate", no_gain)
+    monkeypatch.setattr(decision, "compare_candidate", no_gain)
     first = maintain(bundle, broken(later_grasps[:8], broken_row))
     assert (first.decision, first.version) == ("kept", 1)
     assert "interval of the gain includes 0" in first.reason
-    monkeypatch.setattr(module, "compare_candidate", None)  # would fail if it were asked
+    monkeypatch.setattr(decision, "compare_candidate", None)  # would fail if it were asked
     for log in (later_grasps[8:16], later_grasps[16:]):
         again = maintain(bundle, broken(log, broken_row))
         assert (again.decision, again.exit_code) == ("kept", first.exit_code)
@@ -391,12 +389,10 @@ def test_what_was_kept_once_is_not_judged_again(bundle, later_grasps, broken_row
 def test_a_candidate_in_which_a_class_collapses_is_refused(
     bundle, later_grasps, broken_row, monkeypatch
 ):
-    import adaptfault.robot.maintenance as module
-
     def collapse(running, candidate, windows):
         return Judgement(running=0.5, candidate=0.6, gain=0.1, low=0.05, high=0.15, collapsed=(1,))
 
-    monkeypatch.setattr(module, "compare_candidate", collapse)
+    monkeypatch.setattr(decision, "compare_candidate", collapse)
     report = maintain(bundle, broken(later_grasps, broken_row))
     assert (report.decision, report.version) == ("refused", 1)
     assert bundle.class_names[1] in report.reason
@@ -412,8 +408,6 @@ def exchanged_rows(recordings, bundle):
 def judged(monkeypatch, gain):
     """Let every comparison find this gain: of a network of five epochs, rows hardly change the
     accuracy."""
-    import adaptfault.robot.maintenance as module
-
     found = Judgement(
         running=0.5,
         candidate=0.5 + gain,
@@ -422,7 +416,7 @@ def judged(monkeypatch, gain):
         high=gain + 0.05,
         collapsed=(),
     )
-    monkeypatch.setattr(module, "compare_candidate", lambda running, candidate, windows: found)
+    monkeypatch.setattr(decision, "compare_candidate", lambda running, candidate, windows: found)
 
 
 @pytest.fixture
@@ -524,9 +518,7 @@ def test_a_wiring_that_was_rolled_back_is_not_deployed_again(bundle, later_grasp
 
 
 def test_what_was_deployed_is_never_called_refused(bundle, later_grasps, worthwhile, monkeypatch):
-    import adaptfault.robot.maintenance as module
-
-    monkeypatch.setattr(module, "contradiction", lambda *given: 2.0)
+    monkeypatch.setattr(decision, "contradiction", lambda *given: 2.0)
     report = maintain(bundle, exchanged_rows(later_grasps, bundle))
     assert (report.decision, report.version, report.exit_code) == ("refused", 1, 2)
     assert "residual variance ratio" in report.reason

@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from conftest import rough_fit
 
 import adaptfault as af
 from diagnostics import Fault, SelfDiagnosis, SensorLayout, inject
@@ -40,8 +39,7 @@ def reference() -> list[np.ndarray]:
 
 @pytest.fixture(scope="module")
 def fitted(reference) -> SelfDiagnosis:
-    with rough_fit():
-        return SelfDiagnosis(LAYOUT).fit(reference)
+    return SelfDiagnosis(LAYOUT).fit(reference)
 
 
 def mixed(others: list[int], n: int = 24, sensor: int = 2) -> list[np.ndarray]:

@@ -3,7 +3,6 @@ for it."""
 
 import numpy as np
 import pytest
-from conftest import rough_fit
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -81,8 +80,7 @@ def reference() -> list[np.ndarray]:
 
 @pytest.fixture(scope="module")
 def fitted(reference) -> SelfDiagnosis:
-    with rough_fit():
-        return SelfDiagnosis(PAD).fit(reference)
+    return SelfDiagnosis(PAD).fit(reference)
 
 
 @pytest.fixture(scope="module", params=[(0.35, "row and column"), (0.5, "row")])

@@ -3,7 +3,6 @@ blamed for it."""
 
 import numpy as np
 import pytest
-from conftest import rough_fit
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -41,8 +40,7 @@ def reference() -> list[np.ndarray]:
 
 @pytest.fixture(scope="module")
 def fitted(reference) -> SelfDiagnosis:
-    with rough_fit():
-        return SelfDiagnosis(LAYOUT).fit(reference)
+    return SelfDiagnosis(LAYOUT).fit(reference)
 
 
 @pytest.mark.parametrize("gain", [0.3, 0.6, 2.0, 3.0])
@@ -71,8 +69,7 @@ def test_a_gain_is_measured_where_a_few_counts_are_a_load(gain, seed):
 
 def test_a_gain_with_which_the_amplifier_saturates_is_told_with_both(fitted, reference):
     log = [np.minimum(frames, 500) for frames in grasps(2, 20, 3.0)]
-    with rough_fit():
-        found = af.inspect(log, fitted, reference=reference)
+    found = af.inspect(log, fitted, reference=reference)
     assert {"gain", "saturated"} <= {finding.name for finding in found.findings}
     assert found.change.gain == pytest.approx(3, rel=0.3)
     assert not found.diagnosis.fault_set

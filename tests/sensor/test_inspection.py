@@ -165,7 +165,6 @@ def test_more_noise_of_all_cells_is_told(known, reference, log, times):
     assert found.severity >= 1
 
 
-@pytest.mark.usefixtures("roughly_fitted")
 def test_lost_bits_of_the_converter_are_told(known, reference, log):
     assert "quantised" in names(af.inspect([r // 64 * 64 for r in log], known, reference=reference))
 
@@ -178,7 +177,6 @@ def saturated(frames: np.ndarray) -> np.ndarray:
     return np.minimum(8 * frames, 700)
 
 
-@pytest.mark.usefixtures("roughly_fitted")
 @pytest.mark.parametrize(("changed", "name"), [(fewer_bits, "quantised"), (saturated, "saturated")])
 def test_behind_a_changed_converter_a_dead_cell_is_not_alive_and_at_most_one_other_is_blamed(
     known, reference, log, busy, changed, name

@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from conftest import rough_fit
 
 from adaptfault import Recordings, Restorer, make_windows, summarise
 from diagnostics import Fault, Monitor, SelfDiagnosis, SensorLayout, inject
@@ -31,11 +30,9 @@ def given(request, flat):
 
 @pytest.fixture(scope="module")
 def flat_fit(flat):
-    with rough_fit():
-        return SelfDiagnosis(LAYOUT).fit(list(flat))
+    return SelfDiagnosis(LAYOUT).fit(list(flat))
 
 
-@pytest.mark.usefixtures("roughly_fitted")
 def test_a_diagnosis_is_the_same(flat_fit, given):
     broken = [inject(one, [Fault("short", (7,))], LAYOUT) for one in given]
     wanted = flat_fit.diagnose(broken).to_dict()

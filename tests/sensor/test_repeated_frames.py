@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from conftest import rough_fit
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -54,9 +53,8 @@ def test_frames_that_an_idle_array_repeats_are_no_repeated_frames(grasps):
 def test_a_healthy_log_that_repeats_frames_is_told_so_and_blames_nobody(grasps):
     reference = grasps[::2]
     log = [np.repeat(frames, 4, axis=0) for frames in grasps[1::2]]
-    with rough_fit():
-        fitted = SelfDiagnosis(LAYOUT).fit(reference)
-        found = af.inspect(log, fitted, reference=reference)
+    fitted = SelfDiagnosis(LAYOUT).fit(reference)
+    found = af.inspect(log, fitted, reference=reference)
     told = {finding.name: finding for finding in found.findings}
     assert "75% of the frames repeat" in told["repeated_frames"].reason
     assert "come about 5 times a second" in told["repeated_frames"].reason

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from conftest import rough_fit, worn
+from conftest import worn
 
 import adaptfault as af
 from diagnostics import SelfDiagnosis, SensorLayout
@@ -41,8 +41,7 @@ def reference() -> list[np.ndarray]:
 
 @pytest.fixture(scope="module")
 def fitted(reference) -> SelfDiagnosis:
-    with rough_fit():
-        return SelfDiagnosis(LAYOUT).fit(reference)
+    return SelfDiagnosis(LAYOUT).fit(reference)
 
 
 @pytest.fixture(scope="module")

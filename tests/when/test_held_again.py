@@ -22,8 +22,6 @@ LAYOUT = SensorLayout(1, 4, 5, full_scale=1.0, unit="V", rate=50.0)
 BROKEN = slice(6, 12)  # recordings
 HELD = 7  # cell
 
-pytestmark = pytest.mark.usefixtures("roughly_fitted")
-
 
 def contacts(seed: int, n: int = 24, sign: int = 1) -> list[np.ndarray]:
     """Recordings of contacts that come and go anywhere; what they do not reach reads 0.5."""

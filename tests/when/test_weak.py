@@ -19,8 +19,6 @@ LAYOUT = SensorLayout(1, 4, 5, full_scale=1.0, unit="V", rate=50.0)
 INNER = [6, 7, 8, 11, 12, 13]
 WORN = 7
 
-pytestmark = pytest.mark.usefixtures("roughly_fitted")
-
 
 def contacts(seed: int, n: int = 24, layout: SensorLayout = LAYOUT) -> list[np.ndarray]:
     """Recordings of broad contacts that come and go anywhere."""

@@ -80,7 +80,8 @@ def made_once_each(folder: Path) -> Iterator[None]:
         def adapt_once(faulty: Cells, **stated: Any) -> Adaptation:
             if stated.get("budget") is not None:
                 return adapt(faulty, **stated)
-            asked = ("adapt", hashes, tuple(faulty), sorted(stated.items()))
+            weights = [one.numpy() for one in adapter.model.state_dict().values()]
+            asked = ("adapt", hashes, weights, tuple(faulty), sorted(stated.items()))
             return kept(folder, asked, lambda: adapt(faulty, **stated))
 
         adapter.__dict__["adapt"] = adapt_once

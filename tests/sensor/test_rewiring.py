@@ -123,13 +123,18 @@ def test_faulty_cells_that_move_are_no_change_of_the_wiring(fitted, small_grasps
         assert fitted.rewiring(with_faulty(log(small_grasps, seed), cells, kind, seed)) is None
 
 
-@pytest.mark.parametrize(("kind", "seed"), [(MOVING[0], 1), (MOVING[1], 2), (MOVING[2], 2)])
-def test_exchanged_rows_are_named_beside_faulty_cells(fitted, small_grasps, kind, seed):
-    cells = np.random.default_rng(seed).choice(LAYOUT.n_cells, 3, replace=False)
-    broken = with_faulty(log(small_grasps, seed), cells, kind)
-    found = fitted.rewiring([frames[:, exchanged_rows(0, 1, 4)] for frames in broken])
-    assert found is not None
-    assert found.steps == ("rows 1 and 4 of pad 0 are exchanged",)
+@pytest.mark.parametrize("kind", MOVING)
+def test_exchanged_rows_are_mostly_named_beside_faulty_cells_and_no_others(
+    fitted, small_grasps, kind
+):
+    named = []
+    for seed in range(8):
+        cells = np.random.default_rng(seed).choice(LAYOUT.n_cells, 3, replace=False)
+        broken = with_faulty(log(small_grasps, seed), cells, kind)
+        found = fitted.rewiring([frames[:, exchanged_rows(0, 1, 4)] for frames in broken])
+        named += [] if found is None else list(found.steps)
+    assert set(named) == {"rows 1 and 4 of pad 0 are exchanged"}
+    assert len(named) >= 5
 
 
 def test_a_strap_is_no_change_of_the_wiring():

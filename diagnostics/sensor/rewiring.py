@@ -18,8 +18,8 @@ Candidates are exchanges of two rows or two columns of a pad, a pad mirrored alo
 rows or columns shifted by one, a pad turned by half a turn, one read column by column in place of
 row by row, mirrored or not (a square one is transposed then, or turned by a quarter), and exchanged
 pads. The best is taken, and the search goes on from there, so that combinations are found. A
-permutation is reported if the gain l(P) - l(identity) exceeds 24, is positive without the two
-pieces that favour it most, exceeds by 12 that of any other candidate that moves some of the same
+permutation is reported if the gain l(P) - l(identity) exceeds 24 and three times its standard error
+over the pieces (Vuong 1989), exceeds by 12 that of any other candidate that moves some of the same
 cells, is as large for the working channels alone, and explains half of what a random order leaves
 unexplained; w_t = 1 / (1 + k) discounts a piece that repeats k earlier ones; the 32 that load most
 are scored. A
@@ -59,7 +59,7 @@ _LINES = 16
 _FEW_LINES = 4
 _WORK = 6400  # lines times cells, about: a size
 LIMIT = 2 * CERTAIN_RATIO  # log likelihood gained, all pieces together
-_WITHOUT = 2  # pieces without which there must be a gain too: one odd contact proves nothing
+_ERRORS = 3.0  # standard errors by which the gain of a piece exceeds 0
 # of what a random order of a pad loses: gained where a whole pad is turned; by chance up to 0.03
 _TURNED = 0.05
 _MOST_STEPS = 6  # in which permutations are combined, or the faulty channels found anew: a size
@@ -146,6 +146,8 @@ def find_rewiring(
             for candidate in candidates
         ]
         sums = np.array([score.by_piece.sum() for score in scores])
+        working = ~scores[int(sums.argmax())].faulty
+        sums += [test.usually(candidate.source, working) for candidate in candidates]
         best = int(sums.argmax())
         found = test.settled(candidates[best].source, scores[best])
         # The present order may be as good once the channels that are faulty in the other one are
@@ -170,10 +172,10 @@ def find_rewiring(
         ):
             break
         # The channels that work say so by themselves: no permutation is due to the faulty ones.
-        working = test.of_working(candidates[best].source, found.faulty) - test.of_working(
+        of_working = test.of_working(candidates[best].source, found.faulty) - test.of_working(
             source, found.faulty
         )
-        if not _certain(working):
+        if not _certain(of_working):
             break
         source = candidates[best].source
         total += float(gain.sum())
@@ -189,9 +191,10 @@ def find_rewiring(
 
 
 def _certain(gain: Floats) -> bool:
-    """Return whether the gains of the pieces, ``[n]``, prove a permutation, even without the two
-    largest."""
-    return bool(gain.sum() >= LIMIT and np.sort(gain)[:-_WITHOUT].sum() > 0)
+    """Return whether the gains of the pieces, ``[n]``, prove a permutation: not by a few of them
+    (test of Vuong, 1989)."""
+    error = np.sqrt(len(gain)) * gain.std()
+    return bool(gain.sum() >= max(LIMIT, _ERRORS * error))
 
 
 class _Score(NamedTuple):
@@ -322,6 +325,14 @@ class Test:
         expected = (levels * np.log(levels)).sum(axis=-1)
         return np.where(model.living, np.log(found), impossible), expected
 
+    @cached_property
+    def _usual(self) -> Floats:
+        """Log P(level) of each cell, whatever the others do, ``[D, K]``."""
+        nothing = np.zeros((1, len(self.used)), np.float32)
+        nobody = np.zeros(len(self.used), bool)
+        usual: Floats = np.log(self.model.predictor(nothing, nothing, np.ones(1, bool), nobody)[0])
+        return usual
+
     def score(self, source: Cells, faulty: Mask) -> _Score:
         """Return the score of one permutation; ``faulty`` channels (bool ``[D]``) are no
         predictors."""
@@ -335,6 +346,15 @@ class Test:
         refuted = np.zeros(len(source))
         refuted[source] = by
         return _Score(self.weight * explained.sum(axis=1) - penalty, surplus, refuted)
+
+    def usually(self, source: Cells, working: Mask) -> float:
+        """Return the weighted log likelihood of what the ``working`` channels (bool ``[D]``) did
+        where a permutation puts them, whatever the others did: a pad that is mirrored looks to the
+        others as if the other one were."""
+        _, level = self._put_back(source)
+        usual = self._usual[np.arange(len(source)), level]
+        counted = (self.used & working)[source] & self.model.living
+        return float(self.weight @ np.where(counted, usual, 0.0).sum(axis=1))
 
 
 def strongest(log: Log, some: Cells, most: int, pad_of: Cells) -> tuple[Cells, Floats]:

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import rough_fit, worn
+from conftest import whole_fit, worn
 
 from adaptfault.data.simulated_grasps import simulate
 from diagnostics import SelfDiagnosis, SensorLayout
@@ -17,7 +17,7 @@ GRID = LAYOUT.grid(np.arange(LAYOUT.n_cells))
 
 @pytest.fixture(scope="module")
 def fitted(small_grasps):
-    with rough_fit():
+    with whole_fit():
         return SelfDiagnosis(LAYOUT).fit(small_grasps.frames[:60])
 
 
@@ -142,7 +142,7 @@ def test_a_strap_is_no_change_of_the_wiring():
     lies."""
     layout = SensorLayout(2, 8, 8)
     grasps = simulate(8, layout, n_frames=60, seed=1)
-    with rough_fit():
+    with whole_fit():
         fitted = SelfDiagnosis(layout).fit(grasps.frames)
     later = simulate(4, layout, n_frames=60, seed=99)
     for force in (1.0, 2.0):
@@ -162,7 +162,7 @@ def test_faulty_cells_of_a_real_hand_are_no_change_of_the_wiring():
             for f, n in zip(given["frames"], given["lengths"], strict=True)
         ]
     order = np.random.default_rng(0).permutation(len(recordings))
-    with rough_fit():
+    with whole_fit():
         hand = SelfDiagnosis(layout).fit([recordings[i] for i in order[:300]])
     for seed in range(12):
         rng = np.random.default_rng(seed)
@@ -188,7 +188,7 @@ def test_where_there_are_no_rows_none_are_exchanged(fitted, small_grasps):
 @pytest.mark.parametrize("wiring", [{"wiring": "bus"}, {"groups": {"triangle": range(30)}}])
 def test_one_pad_without_rows_and_columns_has_no_wiring_to_change(small_grasps, wiring):
     recordings = [frames[:, :30] for frames in small_grasps.frames]
-    with rough_fit():
+    with whole_fit():
         one_pad = SelfDiagnosis(SensorLayout(1, 6, 5, **wiring)).fit(recordings[:60])
     assert one_pad.rewiring(recordings[60:]) is None
 

@@ -18,7 +18,7 @@ Candidates are exchanges of two rows or two columns of a pad, a pad mirrored alo
 rows or columns shifted by one, a pad turned by half a turn, one read column by column in place of
 row by row, mirrored or not (a square one is transposed then, or turned by a quarter), and exchanged
 pads. The best is taken, and the search goes on from there, so that combinations are found. A
-permutation is reported if the gain l(P) - l(identity) exceeds 24 and three times its standard error
+permutation is reported if the gain l(P) - l(identity) exceeds 24 and two and a half times its standard error
 over the pieces (Vuong 1989), exceeds by 12 that of any other candidate that moves some of the same
 cells, is as large for the working channels alone, and explains half of what a random order leaves
 unexplained; w_t = 1 / (1 + k) discounts a piece that repeats k earlier ones; the 32 that load most
@@ -39,6 +39,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import expit
 
 from diagnostics.model.symbols import NOTHING, root_load
 from diagnostics.preprocessing.levels import CERTAIN_RATIO, MAJORITY
@@ -54,12 +55,14 @@ _FEWEST = 4  # pieces; fewer prove nothing
 _THE_SAME = 0.95  # cosine from which on two pieces load the same cells
 _PRIOR = 2.0  # pieces that a usual level is worth
 _IMPOSSIBLE = 0.002
+_LEAST_ERROR = 0.02  # of a root load
+_STEEP = 1.8  # logistic distribution of deviation 1
 # of one kind on a pad, the least expected, whose exchange is tried; on large arrays: sizes
 _LINES = 16
 _FEW_LINES = 4
 _WORK = 6400  # lines times cells, about: a size
 LIMIT = 2 * CERTAIN_RATIO  # log likelihood gained, all pieces together
-_ERRORS = 3.0  # standard errors by which the gain of a piece exceeds 0
+_ERRORS = 2.5  # standard errors by which the gain of a piece exceeds 0
 # of what a random order of a pad loses: gained where a whole pad is turned; by chance up to 0.03
 _TURNED = 0.05
 _MOST_STEPS = 6  # in which permutations are combined, or the faulty channels found anew: a size
@@ -320,10 +323,25 @@ class Test:
         known = (self.used & ~faulty)[source] & model.living
         begins = np.ones(len(load), bool)  # what a cell read before tells nothing of its place
         levels = model.predictor(load, load, begins, known)
+        levels = (levels + self._of_mean(load, known)) / 2
         found = np.take_along_axis(levels, level.astype(np.intp)[..., None], 2)[..., 0]
         impossible = np.where(level > 0, np.log(_IMPOSSIBLE), 0.0)
         expected = (levels * np.log(levels)).sum(axis=-1)
         return np.where(model.living, np.log(found), impossible), expected
+
+    def _of_mean(self, load: NDArray[np.float32], known: Mask) -> Floats:
+        """Return P(level) ``[n, D, K]`` by the conditional mean alone, which is right of objects
+        that the reference did not see, too."""
+        predictor = self.model.predictor
+        mean, _ = predictor.mean.predict(load, known)
+        error = np.where(np.isfinite(predictor.error), predictor.error, 1.0) + _LEAST_ERROR
+        edges = self.model.symbols.edges
+        below = expit((edges[:, None, None] - mean) * (_STEEP / error))
+        levels = np.diff(below, axis=0, prepend=0.0, append=1.0)
+        rare = np.full((self.model.symbols.n - len(levels), *mean.shape), _IMPOSSIBLE)
+        found = np.concatenate([levels + _IMPOSSIBLE, rare])
+        of_level: Floats = np.moveaxis(found / found.sum(axis=0), 0, -1)
+        return of_level
 
     @cached_property
     def _usual(self) -> Floats:

@@ -25,12 +25,12 @@ from diagnostics.decision.serialization import (
     to_state,
     write_state,
 )
-from diagnostics.evidence.cold_start import judged_cold
+from diagnostics.evidence.cold_start import ColdStream, judged_cold
 from diagnostics.evidence.read_out import Scan, scanned
 from diagnostics.evidence.reference import Reference, highest_reading, living
+from diagnostics.evidence.reference_faults import find_reference_faults, never_moved
 from diagnostics.evidence.stream_state import StreamState
 from diagnostics.faults import Fault, FaultKind
-from diagnostics.healthy.reference_faults import find_reference_faults, never_moved
 from diagnostics.layout import SensorLayout
 from diagnostics.model import Model, fit_model
 from diagnostics.model.findings import judged_by_model
@@ -64,7 +64,7 @@ from diagnostics.when.reference_findings import (
     reference_findings,
 )
 
-SCHEMA = "adaptfault.diagnoser/4"
+SCHEMA = "adaptfault.diagnoser/5"
 _LASTS = 8  # frames of a contact, at least
 # kinds that a cell shows however the others move
 _OF_ANY_MOVEMENT = (*HOLDS, FaultKind.ALIAS, FaultKind.NOISY)
@@ -79,7 +79,6 @@ class Fitted:
     reference: Reference | None
     load: LoadDirection | None = None
     certificate: Certificate | None = None
-    model: Model | None = None
 
 
 def _no_progress(share: float) -> None:
@@ -105,7 +104,6 @@ class SelfDiagnosis:
     reference_: Reference | None = None
     copies_: NDArray[np.intp] | None = None
     _certificate: Certificate | None = None
-    _model: Model | None = None
     _held_out: tuple[Sequence[NDArray[Any]], NDArray[np.float64]] | None = None
     reference_findings_: tuple[ReferenceFinding, ...] = ()
     _of_log = False  # the reference is a part of the log, which nobody stated to be healthy
@@ -143,11 +141,14 @@ class SelfDiagnosis:
             )
         SelfDiagnosis.__init__(self, **(known | params))
         self.reference_ = None
-        self._model = None
         self.copies_ = None
         self._certificate = None
         self._held_out = None
         return self
+
+    @property
+    def _model(self) -> Model | None:
+        return None if self.reference_ is None else self.reference_.model
 
     def __sklearn_is_fitted__(self) -> bool:
         return self.reference_ is not None
@@ -236,8 +237,8 @@ class SelfDiagnosis:
         near = self.reference_.scale.near
         usual = UsualSizes.of(list(healthy), near, living(layout, dead).present.ravel())
         floors = lowest_floors(healthy, self.reference_.scale.baseline, living(layout, dead))
-        self.reference_ = replace(self.reference_, sizes=usual, floors=floors)
-        self._model = fit_model(list(healthy), layout, dead > 0, progress=progress)
+        model = fit_model(list(healthy), layout, dead > 0, progress=progress)
+        self.reference_ = replace(self.reference_, sizes=usual, floors=floors, model=model)
         self._certificate = None
         self._held_out = (recordings.given, dead[self._place])
         progress(1.0)
@@ -449,7 +450,6 @@ class SelfDiagnosis:
                 self.reference_,
                 self.load_,
                 self._certificate,
-                self._model,
             )
         )
         return {"schema": SCHEMA, **fitted}, arrays
@@ -470,11 +470,10 @@ class SelfDiagnosis:
             diagnoser.reference_ = fitted.reference
             diagnoser.load_ = fitted.load
             diagnoser._certificate = fitted.certificate
-            diagnoser._model = fitted.model
             if fitted.load is not None:
                 fitted.load.check(fitted.layout)
             if fitted.reference is not None:
-                fitted.reference.check(diagnoser._planes)
+                fitted.reference.check()
         except KeyError as error:
             raise ValueError(f"the stored diagnosis is damaged: {error} is missing") from None
         except (TypeError, ValueError, AttributeError) as error:
@@ -502,12 +501,13 @@ class SelfDiagnosis:
         return cls.from_state(*read_state(path))
 
     def stream(self, needed: NDArray[np.bool_] | None = None) -> StreamState:
-        """Return the state before any frame. Only tiles with a ``needed`` cell (bool ``[D]``; None:
-        all) are scored."""
+        """Return the state before any frame. In a cold start, only tiles with a ``needed`` cell
+        (bool ``[D]``; None: all) are scored."""
         reference = self.reference_ or Reference.unknown(self._planes)
         order = self._order if self.layout.axes > 1 else None
-        recorder = None if self._model is None else self._model.recorder()
-        return StreamState(self._planes, reference, needed, self.load_, order, recorder)
+        if self._model is None:
+            return ColdStream(self._planes, reference, needed, self.load_, order)
+        return StreamState(self._planes, reference, self._model.recorder(), self.load_, order)
 
     def evaluate(self, stream: StreamState, *, n_recordings: int = 1) -> Diagnosis:
         """Return the diagnosis of the log behind ``stream``.
@@ -554,10 +554,9 @@ class SelfDiagnosis:
         full_scale = self.layout.full_scale
         if self._model is not None:
             return judged_by_model(self._model, stream, self._planes, rate, full_scale)
-        cold = stream.cold
-        assert cold is not None
-        aliases = find_aliasing(stream, partial(cold.log_likelihood, stream))
-        return judged_cold(cold, stream, aliases, rate, full_scale)
+        assert isinstance(stream, ColdStream)
+        aliases = find_aliasing(stream, partial(stream.cold.log_likelihood, stream))
+        return judged_cold(stream, aliases, rate, full_scale)
 
     def _concluded(self, stream: StreamState, judged: Judged, n_recordings: int) -> Diagnosis:
         """Return the diagnosis of a log by what is known of each cell."""

@@ -36,8 +36,8 @@ from diagnostics import (
     inject,
     line_fault,
 )
-from diagnostics.events.contact_events import ContactEvent
-from diagnostics.healthy.model import contact_events
+from diagnostics.events.constant_runs import segments
+from diagnostics.events.contact_events import ContactEvent, EventLog
 
 Floats = NDArray[np.float64]
 
@@ -91,7 +91,11 @@ def root_load(frames: Floats) -> Floats:
 
 def events_of(frames: Floats) -> tuple[ContactEvent, ...]:
     """Return the contact events of healthy frames ``[T, D]``."""
-    return contact_events(frames, reference().reference_.scale)
+    scale = reference().reference_.scale
+    found = EventLog()
+    for part, numbers, runs in segments(frames, scale):
+        found = found.extend(scale.root_load(part), numbers, scale.root_near, runs.start)
+    return found.kept
 
 
 def panels(*widths: float, height: float = 2.5) -> tuple[Figure, list[Axes]]:
@@ -181,23 +185,6 @@ def events() -> Figure:
     peak, _, _, share = found[0].suffixes()[0].features()
     draw_map(axes[1], peak, "event 1: highest root load", "", vmin=0, vmax=1)
     draw_map(axes[2], share, "event 1: share of frames loaded", "", cmap="cividis", vmin=0, vmax=1)
-    return figure
-
-
-def healthy_model() -> Figure:
-    """Draw what an event does, and what the healthy model expects of each cell given the others."""
-    frames = healthy(seed=4)[0]
-    features = events_of(frames)[0].suffixes()[0].features()[None]
-    model = reference().reference_.model
-    expected = model.predict(features, np.ones(LAYOUT.n_cells, bool))
-    figure, axes = panels(1, 1, 1)
-    draw_map(axes[0], features[0, 1], "observed mean root load", "", vmin=0, vmax=0.8)
-    never = expected.never[0]
-    draw_map(axes[1], never, "P(never loaded | other cells)", "", cmap="Blues", vmin=0, vmax=1)
-    load = np.where(never < 0.5, expected.mean[0], 0)
-    draw_map(axes[2], load, "expected mean root load | other cells", "", vmin=0, vmax=0.8)
-    for cell in np.flatnonzero(features[0, 2] > 0):
-        outline(axes[1], int(cell), "#e67e22")
     return figure
 
 
@@ -333,7 +320,6 @@ FIGURES: dict[str, Callable[[], Figure]] = {
     "diagnosis": diagnosis,
     "events": events,
     "ageing": ageing,
-    "healthy-model": healthy_model,
     "root-causes": root_causes,
     "repair": repair,
     "forecast": forecast,

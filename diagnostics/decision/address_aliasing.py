@@ -3,8 +3,8 @@
 Detects a stuck address bit (pairs whose indices differ in one bit), a bridge of two neighbouring
 lines, and one line read twice. A bit explains several pairs with one fault and is preferred; it is
 refuted when another pair of the same bit differs later. The level of a bit follows from the log
-ratio of the plausibility of the lines that it leaves intact, under the healthy model; below 3 both
-levels are reported. Lines that nothing loads are not detected here.
+ratio of the plausibility of the lines that it leaves intact, under the model of the array; below 3
+both levels are reported. Lines that nothing loads are not detected here.
 """
 
 from __future__ import annotations
@@ -167,7 +167,7 @@ def _level_ratio(
     """Return the log ratio of a bit stuck at 1 against stuck at 0.
 
     Each level leaves other lines intact; the ratio compares their pseudo-likelihoods under the
-    healthy model.
+    model of the array.
     """
     layout = stream.layout
     ratio = 0.0

@@ -93,9 +93,9 @@ class Diagnosis:
         static_loads: objects that lie still on the array. Their cells are UNTESTED.
         transport: lost frames, frozen streams and invalid readings: faults of the link, not of
             cells.
-        evidence: float ``[D]`` each: ``"spatial"`` and ``"temporal"``, log likelihood ratios faulty
-            : healthy (0: no evidence), and ``"events"``, number of events that tested the cell.
-            Evidence of wires is in ``faults``.
+        evidence: float ``[D]`` each: ``"spatial"`` and, in a cold start, ``"temporal"``, log
+            likelihood ratios faulty : healthy (0: no evidence), and ``"events"``, number of
+            events that tested the cell. Evidence of wires is in ``faults``.
         states: uint8 ``[n_recordings, D]``, the verdict of each cell in each recording; None: all
             recordings have that of the log. :attr:`by_recording` tells them.
         names: of the recordings; empty: they are numbered from 0.

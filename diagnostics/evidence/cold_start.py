@@ -27,10 +27,11 @@ from diagnostics.events.contact_events import EventLog
 from diagnostics.events.tiled_events import TiledEvents
 from diagnostics.events.tiles import Rectangle, tiles
 from diagnostics.evidence.conditional_test import CellState, Model
+from diagnostics.evidence.nearest_neighbours import NearestNeighbours
 from diagnostics.evidence.rest_level import RestLevel
 from diagnostics.evidence.spatial import Spatial, SpatialTest
+from diagnostics.evidence.stream_state import StreamState
 from diagnostics.evidence.weak_response import WeakResponse
-from diagnostics.healthy.nearest_neighbours import NearestNeighbours
 from diagnostics.preprocessing.levels import (
     CERTAIN_RATIO,
     DOUBTED,
@@ -38,19 +39,24 @@ from diagnostics.preprocessing.levels import (
     RARE,
     SUSPICIOUS,
 )
+from diagnostics.preprocessing.readings import SEGMENT
 from diagnostics.preprocessing.rest_of_log import RestOfLog
 
 if TYPE_CHECKING:
-    from diagnostics.evidence.stream_state import StreamState
+    from diagnostics.evidence.prediction import Prediction
+    from diagnostics.evidence.reference import Reference
     from diagnostics.faults import Fault
-    from diagnostics.healthy.prediction import Prediction
     from diagnostics.layout import SensorLayout
+    from diagnostics.preprocessing.load import LoadDirection
     from diagnostics.preprocessing.scale import Array, Scale
 
 # with more events in a tile, all but the last are scored and dropped
 MAX_EVENTS = 40
 KEPT_EVENTS = 32
 _PASSES = 2  # of several tiles
+# a shorter segment, as the last one of a log, leaves old events for the next one
+_FEW = SEGMENT // 2
+_CLEAR = 4.0  # times the tolerance of two equal lines: lighter loads are equal by chance
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -237,6 +243,52 @@ class ColdStart:
         return _on_rectangle(replace(model, log=own.on(model.log)).predict, own)
 
 
+class ColdStream(StreamState):
+    """The state of a log without a model after some frames.
+
+    Args:
+        layout: the array.
+        reference: what is known of it.
+        needed: bool ``[D]``, the cells to be scored; None: all.
+        load, order: as of :class:`StreamState`.
+
+    Attributes:
+        cold: what such a log keeps.
+    """
+
+    def __init__(
+        self,
+        layout: SensorLayout,
+        reference: Reference,
+        needed: Mask | None = None,
+        load: LoadDirection | None = None,
+        order: Cells | None = None,
+    ) -> None:
+        super().__init__(layout, reference, None, load, order)
+        self.cold = ColdStart.begin(layout, needed)
+
+    def _close(self) -> None:
+        if self._filled > _FEW and self.cold.is_full:
+            self.cold = self.cold.dropped(self)
+        super()._close()
+
+    def _scale_after(self, frames: Floats, plain: Scale, noisy: Scale) -> Scale:
+        self.cold = self.cold.rested(self, frames, plain, self._noise.range)
+        return self.cold.scale(self, plain)
+
+    def _touched_in(self, steady: Floats, root: Array, numbers: Cells, moved: Mask) -> Mask:
+        ended = self.runs.start != self.before.start
+        self.cold = self.cold.extend(self, ended, steady, root, numbers)
+        # Where a cell rests that never moved is unknown: at its lowest reading at most.
+        rise = np.fmax.reduce(steady) - self.lowest
+        surely: Mask = moved | (rise > max(self.scale.near, self._noise.range))
+        return np.asarray(super()._touched_in(steady, root, numbers, moved) & surely)
+
+    def _clear(self, plain: Scale, noisy: Scale) -> Scale:
+        # How often healthy lines with light loads agree is unknown.
+        return replace(plain, near=max(self.scale.near, _CLEAR * plain.near))
+
+
 def _on_rectangle(model: Model, own: Rectangle) -> Model:
     """Return the model of the inputs of a tile; ``model`` is that of their bounding rectangle."""
 
@@ -248,8 +300,7 @@ def _on_rectangle(model: Model, own: Rectangle) -> Model:
 
 
 def judged_cold(
-    cold: ColdStart,
-    stream: StreamState,
+    stream: ColdStream,
     aliases: tuple[list[Fault], Mask],
     rate: float,
     full_scale: float,
@@ -257,12 +308,12 @@ def judged_cold(
     """Return what a log without a reference says of each cell.
 
     Args:
-        cold: what the log keeps for it.
         stream: the log.
         aliases: causes of lines that read the same, and the cells that these explain, bool ``[D]``.
         rate: expected share of healthy cells among those that are faulty.
         full_scale: of the layout.
     """
+    cold = stream.cold
     causes, explained = aliases
     spatial = cold.spatial(stream, explained)
     temporal = cold.temporal(stream)

@@ -28,7 +28,7 @@ from scipy.special import expit, logit, softmax
 
 from diagnostics.events.constant_runs import SHORTEST_RUN, ConstantRuns
 from diagnostics.events.contact_events import THE_SAME, ContactEvent, count_repeats
-from diagnostics.healthy.prediction import MEDIAN_ERROR, Prediction
+from diagnostics.evidence.prediction import MEDIAN_ERROR, Prediction
 from diagnostics.preprocessing.levels import ANYWHERE, P_MIN
 from diagnostics.preprocessing.scale import Array, Scale
 

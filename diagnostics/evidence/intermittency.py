@@ -31,7 +31,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from diagnostics.events.constant_runs import SHORTEST_RUN, segments
-from diagnostics.healthy.cross_fitting import FOLDS
 from diagnostics.layout import SensorLayout
 from diagnostics.preprocessing.levels import LIGHT, MARGIN
 from diagnostics.preprocessing.readings import SEGMENT
@@ -41,6 +40,7 @@ if TYPE_CHECKING:
 
 Floats = NDArray[np.float64]
 
+_FOLDS = 4
 _BLINK_RATE = 0.05  # blinks per loaded frame of a loose contact
 LONGEST_BLINK = 6  # frames
 # neighbours on the same row and column, see SensorLayout.beside
@@ -135,7 +135,7 @@ class HealthyRates:
         # Cross-fitting: new recordings may exceed the rates of few others.
         reached = np.zeros((2, layout.n_cells))
         every = np.random.default_rng(0).permutation(len(recordings))
-        for fold in np.array_split(every, min(FOLDS, len(every))):
+        for fold in np.array_split(every, min(_FOLDS, len(every))):
             others = np.setdiff1d(every, fold) if len(fold) < len(every) else fold
             usual = cls._of([counts[i] for i in others], scale, alone, lowest)
             intermittency = Intermittency.begin(layout)

@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from diagnostics.evidence.intermittency import HealthyRates
 from diagnostics.evidence.usual_duplicates import UsualDuplicates
-from diagnostics.healthy.model import HealthyModel
-from diagnostics.healthy.tiled_model import fit_healthy_model
+from diagnostics.model.judge import Model
 from diagnostics.preprocessing.baseline import baseline
 from diagnostics.preprocessing.noise import UsualNoise
 from diagnostics.preprocessing.offset import ReferenceOffset, levelled, levels
@@ -38,7 +37,7 @@ class Reference:
         patience: repetitions of a frame after which it carries no information.
         usual: rates of blinks and excess noise of healthy cells.
         duplicates: coincidences that two healthy lines may have, and how often each pair agrees.
-        model: of contact events, for the wiring and for single gains; None: unknown.
+        model: of the array; None: unknown, or no cell moves.
         dead: float ``[D]``, P(dead) of the reference faults, 0 for all other cells.
         loaded_patience: the same of a frame with load; 0: as ``patience``.
         noise: what all cells have; None: unknown.
@@ -53,7 +52,7 @@ class Reference:
     patience: int
     usual: HealthyRates
     duplicates: UsualDuplicates
-    model: HealthyModel | None
+    model: Model | None
     dead: NDArray[np.float64]
     loaded_patience: int = 0
     noise: UsualNoise | None = None
@@ -66,11 +65,11 @@ class Reference:
         loaded_from = np.where(present, self.scale.baseline + self.scale.near, np.inf)
         return Patience(self.patience, self.loaded_patience or self.patience, loaded_from)
 
-    def check(self, layout: SensorLayout) -> None:
-        """Check the numbers, and that the model covers each cell of ``layout`` once.
+    def check(self) -> None:
+        """Check the numbers.
 
         Raises:
-            ValueError: a number is not positive, or a cell is not covered once.
+            ValueError: one is not positive.
         """
         rates = (self.usual.blinks, self.usual.blinks_count, self.usual.noise_counts)
         positive = (
@@ -83,8 +82,6 @@ class Reference:
             raise ValueError(
                 f"expected positive tolerance, near, patience and rates, got {positive}"
             )
-        if self.model is not None:
-            self.model.check(living(layout, self.dead))
 
     @classmethod
     def fit(
@@ -93,8 +90,8 @@ class Reference:
         layout: SensorLayout,
         dead: NDArray[np.float64] | None = None,
     ) -> Reference:
-        """Fit to fault-free recordings, ``[T, D]`` each, without the cells that are ``dead``
-        (P(dead) ``[D]``)."""
+        """Fit all but the model to fault-free recordings, ``[T, D]`` each, without the cells that
+        are ``dead`` (P(dead) ``[D]``)."""
         tolerance = tolerance_of(recordings, layout)
         dead = np.zeros(layout.n_cells) if dead is None else dead
         layout = living(layout, dead)
@@ -106,7 +103,6 @@ class Reference:
         rest = np.where(dead > 0, np.median(highest[present]), highest)
         scale = Scale(rest, 2 * tolerance, layout.full_scale)
         patience = Patience.fit(recordings, np.where(present, rest + scale.near, np.inf), SEGMENT)
-        model = fit_healthy_model(recordings, layout, scale)
         return cls(
             tolerance,
             scale,
@@ -114,7 +110,7 @@ class Reference:
             patience.idle,
             HealthyRates.fit(recordings, scale, layout),
             UsualDuplicates.fit(recordings, layout, scale),
-            model,
+            None,
             dead,
             # At another level every cell seems loaded.
             patience.idle if level.any() else patience.loaded,

@@ -33,7 +33,7 @@ from diagnostics.preprocessing.levels import SUSPICIOUS, TESTED
 
 if TYPE_CHECKING:
     from diagnostics.events.contact_events import ContactEvent
-    from diagnostics.healthy.prediction import Prediction
+    from diagnostics.evidence.prediction import Prediction
 
 _MOST_ROUNDS = 16  # of scoring and updating the predictors, and of excluding drifting cells: a size
 

@@ -2,13 +2,12 @@
 split into blocks.
 
 Frames are processed in segments of 32. With a model of the array the state builds the record that
-it judges; without one it keeps what a cold start needs (:mod:`diagnostics.evidence.cold_start`).
+it judges; without one :mod:`diagnostics.evidence.cold_start` keeps more.
 """
 
 from __future__ import annotations
 
 from copy import copy
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -16,7 +15,6 @@ from numpy.typing import NDArray
 
 from diagnostics.events.constant_runs import ConstantRuns
 from diagnostics.events.tiles import MOST_CELLS
-from diagnostics.evidence.cold_start import ColdStart
 from diagnostics.evidence.duplicate_lines import DuplicateLines, informative
 from diagnostics.evidence.intermittency import Intermittency
 from diagnostics.preprocessing.levels import MAJORITY
@@ -30,17 +28,15 @@ if TYPE_CHECKING:
     from diagnostics.layout import SensorLayout
     from diagnostics.model.record import Record, Recorder
     from diagnostics.preprocessing.load import LoadDirection
-    from diagnostics.preprocessing.scale import Scale
+    from diagnostics.preprocessing.scale import Array, Scale
     from diagnostics.sensor.crosstalk import Crosstalk
 
 # consecutive frames without a reading: not chance any more
 _SILENT = 2 * SEGMENT
 _NEVER_RECEIVED = SEGMENT // 2
-# a shorter segment, as the last one of a log, leaves old events for the next one
-_FEW = SEGMENT // 2
 _WHOLE = 1e-6  # by which a whole number may be missed after a conversion to loads and back
-_CLEAR = 4.0  # times the tolerance of two equal lines: lighter loads are equal by chance
 
+Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Cells = NDArray[np.intp]
 
@@ -51,10 +47,9 @@ class StreamState:
     Args:
         layout: the array.
         reference: the healthy reference.
-        needed: bool ``[D]``, the cells to be scored in a cold start; None: all.
+        recorder: builds the record that the model judges; None: there is no model.
         load: how readings become loads; None: they are.
         order: int ``[D]``, which reading of a frame each cell is; None: they are in order.
-        recorder: builds the record that the model judges; None: there is no model.
 
     Attributes:
         transport: lost and repeated frames.
@@ -64,7 +59,6 @@ class StreamState:
         touched: bool ``[D]``, cells that were loaded at least once.
         scale: baseline with the present offsets, and full scale.
         below: bool ``[D]``, cells that last read less than at rest.
-        cold: what a log without a model keeps; None: there is one.
         crosstalk: of lines, that the reference does not have; None: not known.
     """
 
@@ -72,10 +66,9 @@ class StreamState:
         self,
         layout: SensorLayout,
         reference: Reference,
-        needed: Mask | None = None,
+        recorder: Recorder | None,
         load: LoadDirection | None = None,
         order: Cells | None = None,
-        recorder: Recorder | None = None,
     ) -> None:
         self.layout = layout
         self.reference = reference
@@ -87,7 +80,6 @@ class StreamState:
         self._patience = reference.repeats(layout)
         self.runs = ConstantRuns.begin(layout.n_cells)
         self.before = self.runs
-        self.cold = ColdStart.begin(layout, needed) if recorder is None else None
         self.intermittency = Intermittency.begin(layout)
         self.duplicates = DuplicateLines.begin(layout, reference.duplicates.shares)
         self.touched = np.zeros(layout.n_cells, bool)
@@ -107,7 +99,7 @@ class StreamState:
         """Take the next frame as the first one of a recording: it does not follow the last one."""
         self._begins_next = True
 
-    def extend(self, frames: NDArray[np.float64]) -> bool:
+    def extend(self, frames: Floats) -> bool:
         """Take in frames ``[t, D]`` of readings; return whether a segment was completed."""
         if self.order is not None:
             frames = frames[:, self.order]
@@ -167,11 +159,11 @@ class StreamState:
         other._begins = self._begins.copy()
         return other
 
-    def reading(self, load: NDArray[np.float64]) -> NDArray[np.float64]:
+    def reading(self, load: Floats) -> Floats:
         """Return the readings of loads ``[D]``, where they are not the same."""
         return load if self.load is None else self.load.readings(load, self.below)
 
-    def typical_reading(self) -> NDArray[np.float64]:
+    def typical_reading(self) -> Floats:
         """Return the reading of each cell's constant run, ``[D]``: in whole counts where it has
         such readings.
 
@@ -189,7 +181,7 @@ class StreamState:
         counts = np.where(2 * runs.same > runs.length, last, beside)
         return np.where(whole, counts, middle)
 
-    def blinks_to(self, full_scale: float) -> NDArray[np.float64]:
+    def blinks_to(self, full_scale: float) -> Floats:
         """Return the reading to which each cell blinks, ``[D]``: full scale where most blinks go
         there."""
         frames = self.intermittency
@@ -234,13 +226,13 @@ class StreamState:
         return np.asarray(still & idle[of_pad] & bool(used.any()))
 
     @property
-    def ranges(self) -> NDArray[np.float64]:
+    def ranges(self) -> Floats:
         """Highest minus lowest reading of each cell, ``[D]``; 0: none."""
-        found: NDArray[np.float64] = np.nan_to_num(self._highest - self.lowest)
+        found: Floats = np.nan_to_num(self._highest - self.lowest)
         return found
 
     @property
-    def lowest(self) -> NDArray[np.float64]:
+    def lowest(self) -> Floats:
         """The lowest reading of each cell so far, ``[D]``; inf: none."""
         return self.reference.scale.baseline + self._offsets.lowest
 
@@ -261,8 +253,6 @@ class StreamState:
 
     def _close(self) -> None:
         """Process a segment."""
-        if self.cold is not None and self._filled > _FEW and self.cold.is_full:
-            self.cold = self.cold.dropped(self)
         frames = self._buffer[: self._filled]
         numbers = self._numbers[: self._filled]
         begins = self._begins[: self._filled]
@@ -278,10 +268,7 @@ class StreamState:
         plain = self._offsets.on(reference.scale)
         noise = 0.0 if reference.noise is None else reference.noise.raises(self._noise)
         noisy = plain.above(noise)
-        self.scale = noisy
-        if self.cold is not None:
-            self.cold = self.cold.rested(self, frames, plain, self._noise.range)
-            self.scale = self.cold.scale(self, plain)
+        self.scale = self._scale_after(frames, plain, noisy)
         known = _known(frames, self.runs.last)
         moved = self.runs.moved & self.received
         self.before = self.runs
@@ -289,17 +276,7 @@ class StreamState:
         still = self.runs.start <= numbers[0]
         steady = self._offsets.off(known)
         root = self.scale.root_load(steady)
-        touched = root.any(axis=0)
-        clear = noisy
-        if self.cold is not None:
-            ended = self.runs.start != self.before.start
-            self.cold = self.cold.extend(self, ended, steady, root, numbers)
-            # How often healthy lines with light loads agree is unknown.
-            clear = replace(plain, near=max(self.scale.near, _CLEAR * plain.near))
-            # Where a cell rests that never moved is unknown: at its lowest reading at most.
-            rise = np.fmax.reduce(steady) - self.lowest
-            touched &= moved | (rise > max(self.scale.near, self._noise.range))
-        self.touched = self.touched | touched
+        self.touched = self.touched | self._touched_in(steady, root, numbers, moved)
         usual = reference.usual.with_noise(noise / plain.full_scale)
         self.intermittency = self.intermittency.extend(
             known, root, numbers, noisy, usual, still, begins=begins
@@ -309,11 +286,34 @@ class StreamState:
             # between two lines.
             frames = np.where(self.runs.moved, frames, np.nan)
         # Lines that only have noise where they rest agree by chance.
-        telling = informative(frames, still, clear) & self.touched
+        telling = informative(frames, still, self._clear(plain, noisy)) & self.touched
         self.duplicates = self.duplicates.extend(frames, numbers, telling, plain.near)
 
+    def _scale_after(self, frames: Floats, plain: Scale, noisy: Scale) -> Scale:
+        """Return the scale of the log after the frames ``[t, D]`` of a segment.
 
-def _known(frames: NDArray[np.float64], last: NDArray[np.float64]) -> NDArray[np.float64]:
+        Args:
+            frames: NaN = missing.
+            plain: the scale without knowledge of the log; noisy: with its noise.
+        """
+        return noisy
+
+    def _touched_in(self, steady: Floats, root: Array, numbers: Cells, moved: Mask) -> Mask:
+        """Return the cells that are loaded in a segment, bool ``[D]``.
+
+        Args:
+            steady, root: readings and root loads ``[t, D]``, without changes of the offset.
+            numbers: int ``[t]``, of the frames.
+            moved: bool ``[D]``, cells that moved before.
+        """
+        return np.asarray(root.any(axis=0))
+
+    def _clear(self, plain: Scale, noisy: Scale) -> Scale:
+        """Return the scale of loads that tell whether two lines read the same."""
+        return noisy
+
+
+def _known(frames: Floats, last: Floats) -> Floats:
     """Return ``frames`` with each missing reading replaced by the one before it; ``last`` holds
     those before all.
 

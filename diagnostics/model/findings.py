@@ -61,7 +61,6 @@ def judged_by_model(
         shown=follows & touched & stream.touched & model.living,
         evidence={
             "spatial": found.weight,
-            "temporal": np.zeros(len(found.weight)),
             "events": found.events.astype(np.float64),
         },
         still=still,

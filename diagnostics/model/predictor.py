@@ -21,6 +21,7 @@ from diagnostics.layout import SensorLayout
 from diagnostics.model.conditional_mean import ConditionalMean, loaded
 from diagnostics.model.record import Array, Cells, Mask
 from diagnostics.model.symbols import NOTHING
+from diagnostics.preprocessing.levels import FEWEST
 
 _GUESS = 0.002  # of a uniform distribution in any prediction: models err
 _BLUR = 0.02  # of a level that is one further up, or down
@@ -33,6 +34,7 @@ _AVERAGED = 0.3  # of the last steps (Polyak and Juditsky 1992)
 _EPOCHS = 12  # at most
 _RATE = 0.02
 _AT_ONCE = 16_384  # predictions
+_LEAST_ERROR = 0.02  # of a root load: none is expected more exactly
 _RINGS = {1: (1,), 2: (2,), 4: (4, 5, 8)}  # squared distances of the cells of a ring
 
 
@@ -138,6 +140,8 @@ class Predictor:
         beside: int ``[D, k]``, cells beside each one; -1: none.
         usual: ``[D, k]``, how often and how much each cell is loaded.
         mean: the conditional mean; those of the folds while the model is fitted.
+        error: ``[D]``, root mean square error of the conditional mean of the load of each cell
+            while it is loaded; infinite: it never is.
         network: None: not fitted yet.
     """
 
@@ -147,6 +151,7 @@ class Predictor:
     beside: Cells
     usual: Array
     mean: ConditionalMean
+    error: Array
     network: Network | None = None
 
     @classmethod
@@ -160,7 +165,8 @@ class Predictor:
         much = load.sum(axis=0) / np.maximum(on.sum(axis=0), 1)
         usual = np.stack([often, much, load.std(axis=0)], axis=1).astype(np.float32)
         around = _around(layout, living)
-        return cls(living, layout.pad_of, around, layout.beside, usual, mean)
+        error = _error(load, mean.predict(load, living)[0])
+        return cls(living, layout.pad_of, around, layout.beside, usual, mean, error)
 
     def inputs(self, load: Array, own: Array, first: Mask, known: Mask) -> Array:
         """Return the inputs of the network, ``[n, D, k]``.
@@ -230,6 +236,18 @@ def _errs(n: int) -> Array:
     blur[[0, -1], [0, -1]] += _BLUR
     found: Array = ((1 - _GUESS) * blur + _GUESS / n).astype(np.float32)
     return found
+
+
+def _error(load: Array, expected: Array) -> Array:
+    """Return the root mean square error of the expected root load of each cell, ``[D]`` of
+    ``[n, D]``, where it is loaded; infinite: it never is."""
+    on = load > NOTHING
+    pieces = on.sum(axis=0)
+    squares = np.where(on, (load - expected) ** 2, 0).sum(axis=0)
+    usual = np.sqrt(squares.sum() / max(1, pieces.sum()))
+    error = np.sqrt(squares / np.maximum(pieces, 1))
+    error = np.maximum(np.where(pieces < FEWEST, 2 * usual, error), _LEAST_ERROR)
+    return np.where(pieces > 0, error, np.inf).astype(np.float32)
 
 
 def _before(values: Array, first: Mask) -> Array:

@@ -1,7 +1,7 @@
 """Another sensor in some of the recordings: their cells rest and answer otherwise, each in its way.
 
 Each recording has a signature: the low quantile of each cell, and the mean log ratio of its load to
-what the healthy model expects from the other cells, less what the cells of the pad share. The
+what the model of the array expects from the other cells, less what the cells of the pad share. The
 reference tells how signatures vary: the covariance of its low quantiles (Ledoit and Wolf 2004)
 whitens them, and the variance of a cell's ratios weighs these. Two groups of recordings are found
 by two-means, pad by pad. A recording is scored by the log likelihood ratio of the groups, learned
@@ -38,7 +38,6 @@ from diagnostics.sensor.recalibration import (
     common_spread,
     complete,
     neighbours_agree,
-    noise_of,
 )
 from diagnostics.sensor.rewiring import LIMIT
 from diagnostics.when.recording_numbers import ranges
@@ -138,7 +137,7 @@ def find_another_sensor(
     if min(len(log), len(usual)) < FEWEST:
         return None
     used = layout.present.ravel() & (reference.dead == 0) & ~excluded
-    fit = Fit(reference, layout, used, np.zeros(layout.n_cells), noise_of(usual))
+    fit = Fit.of(reference, layout, used, usual)
     both = _Readings.of([*usual, *log], len(usual), fit)
     pads = [_Pad.of(both, on, len(usual), fit) for on in fit.pads if (on & used).any()]
     other, differing = _split(pads, len(log))
@@ -208,7 +207,7 @@ class _Readings:
                 shared[:, pad] = of_pad[:, None]
         own = low - rest - shared
         varies = median_abs_deviation(own[:n_usual], axis=0, scale="normal")
-        rests: Mask = np.asarray(varies <= SLIGHT / 2 * fit.reference.scale.full_scale)
+        rests: Mask = np.asarray(varies <= SLIGHT / 2 * fit.model.symbols.rest.full)
         size = max(2 * fit.reference.tolerance, SLIGHT / 10 * fit.layout.full_scale)
         away = median_abs_deviation(low[:n_usual], axis=0, scale="normal")
         spread: Floats = np.hypot(away, size)
@@ -384,7 +383,7 @@ class _Pad:
             return False
         spread = common_spread(lows[0], lows[1], self.readings.rests)
         most = self.readings.rests.mean() > MAJORITY
-        rests = most and spread >= SLIGHT / 4 * self.fit.reference.scale.full_scale
+        rests = most and spread >= SLIGHT / 4 * self.fit.model.symbols.rest.full
         return uniform or rests or self.gains_differ(other, usual)
 
     def _neighbours_agree(self, values: Floats, known: Mask) -> bool:
@@ -401,7 +400,7 @@ class _Pad:
         of_cells = offset[self.readings.rests]
         shared = float(np.median(of_cells))
         even = np.abs(of_cells - shared).max() <= abs(shared) / 2
-        return bool(even and abs(shared) >= 2 * LIGHT * self.fit.reference.scale.full_scale)
+        return bool(even and abs(shared) >= 2 * LIGHT * self.fit.model.symbols.rest.full)
 
     def gains_differ(self, other: Mask, usual: Mask) -> bool:
         """Return whether the gains of most cells differ between recordings (bool ``[n]``)."""

@@ -5,12 +5,13 @@ A new specimen of a pad has other gains and offsets. The reading of cell i is mo
 
     reading = g_i usual reading + o_i
 
-o_i follows from low quantiles, without noise that came. log g_i is the mean of 2 log(y_e / m_e)
-over the events e that load the cell, for its root load y_e and the mean m_e that the healthy model
-expects from the other cells; the readings are corrected and the means computed again, until they
-agree (Gauss-Seidel).
+o_i follows from low quantiles, without noise that came. log g_i is the mean of 2 log(y_t / m_t)
+over the pieces t that load the cell, for its root load y_t and the conditional mean m_t that the
+model of the array expects from the other cells; the readings are corrected and the means computed
+again, until they agree (Gauss-Seidel). Successive pieces that load a cell are one contact, and
+count as one.
 Cells of one pad share a normal prior of log g, with mean and variance estimated from them
-(random-effects model, DerSimonian and Laird 1986), so that cells with few events take the gain of
+(random-effects model, DerSimonian and Laird 1986), so that cells with few contacts take the gain of
 their pad. A pad was replaced where its cells differ from each other: either half of the recordings
 gives them the same gains or offsets, with a standard deviation over the cells (the root of the
 comedian of the halves, which a few faulty cells do not raise; Falk 1997) of half of log 1.3 or 1 %
@@ -20,8 +21,8 @@ recordings that it was not learned from, by more than four standard errors over 
 two in the older and in the newer half, where it is to be undone. Exchanged wires, once put back,
 must not raise it more.
 
-Not detected: other noise, other thresholds, and gains of cells that no event loads: these take the
-mean of their pad.
+Not detected: other noise, other thresholds, and gains of cells that no contact loads: these take
+the mean of their pad.
 """
 
 from __future__ import annotations
@@ -35,27 +36,29 @@ from numpy.typing import NDArray
 from scipy.special import ndtri
 from scipy.stats import chi2
 
-from diagnostics.healthy.model import contact_events
-from diagnostics.healthy.prediction import OUTLIERS, log_student_t
-from diagnostics.preprocessing.levels import FEWEST, LOW, MARGIN, SLIGHT
+from diagnostics.evidence.prediction import OUTLIERS, log_student_t
+from diagnostics.model.symbols import NOTHING, root_load
+from diagnostics.preprocessing.levels import FEWEST, LOW, SLIGHT
 from diagnostics.preprocessing.readings import held
 from diagnostics.sensor.gain import GAIN
 
 if TYPE_CHECKING:
     from diagnostics.evidence.reference import Reference
-    from diagnostics.healthy.prediction import Prediction
     from diagnostics.layout import SensorLayout
-    from diagnostics.preprocessing.scale import Array
+    from diagnostics.model.judge import Model
+    from diagnostics.model.record import Array, Record
 
 _FEWEST = 12  # recordings
-_FEWEST_EVENTS = 3  # of a cell: fewer prove no gain
+_FEWEST_LOADED = 3  # recordings that load a cell: fewer prove no gain
+_SHOWN = 0.1  # root load that is expected, from which on a cell shows its gain
+_RARELY = 0.002  # a cell is loaded, or unloaded, whatever the others say
 _ERRORS = 4.0  # standard errors of the gain in pseudo-likelihood
 # of the correction; share of each correction that is applied: neighbours err together
 _ROUNDS = 4
 _STEP = 0.6
-_LEAST_VARIANCE = 0.02  # of 2 log(y / m) in one event: events of a log are similar
+_LEAST_VARIANCE = 0.02  # of 2 log(y / m) in one contact: contacts of a log are similar
 _MEDIAN_DEVIATION = 0.6745  # of a normal distribution, in standard deviations
-_FARTHEST = 1.5  # 2 log(y / m) of one event counts no more
+_FARTHEST = 1.5  # 2 log(y / m) of one piece counts no more
 _WIDE = 1.5  # standardised errors beyond this count less (Huber 1964)
 
 Floats = NDArray[np.float64]
@@ -136,9 +139,7 @@ def find_recalibration(
     old = [filled for r in healthy if (filled := complete(r, reference)) is not None]
     if reference.model is None or len(new) < _FEWEST or len(old) < _FEWEST:
         return None
-    usual = noise_of(old)
-    least = np.quantile(np.concatenate(old), LOW, axis=0)
-    fit = Fit(reference, layout, used, least, usual)
+    fit = Fit.of(reference, layout, used, old)
     halves = new[::2], new[1::2]
     of_halves = [fit.learned(half) for half in halves]
     differing = [on for on in fit.pads if fit.differ(on & used, *of_halves)]
@@ -164,7 +165,7 @@ def find_recalibration(
         return None
     log_gain, offset = fit.learned(new)
     gain = np.ones_like(log_gain)
-    rest = reference.scale.baseline
+    rest = fit.model.symbols.rest.level
     if rival is not None and fit.prefers(rival, halves, of_halves, [differing[i] for i in certain]):
         return None
     replaced = []
@@ -237,17 +238,34 @@ class Fit:
 
     Attributes:
         reference: of the array.
+        model: of the same.
         layout: the array.
         used: bool ``[D]``, cells that serve as predictors.
         least: float ``[D]``, low quantile of the readings of the reference.
         noise: float ``[D]``, its noise.
+        usual: float ``[D]``, mean of 2 log(y / m) there.
     """
 
     reference: Reference
+    model: Model
     layout: SensorLayout
     used: Mask
     least: Floats
     noise: Floats
+    usual: Floats
+
+    @classmethod
+    def of(
+        cls, reference: Reference, layout: SensorLayout, used: Mask, healthy: Sequence[Floats]
+    ) -> Fit:
+        """Return the fit to the ``healthy`` recordings of a reference that has a model."""
+        assert reference.model is not None
+        least = np.quantile(np.concatenate(healthy), LOW, axis=0)
+        known = used & reference.model.living
+        none = np.zeros(layout.n_cells)
+        fit = cls(reference, reference.model, layout, known, least, noise_of(healthy), none)
+        usual, _ = _ratios(*fit.by_recording(healthy))
+        return replace(fit, usual=np.nan_to_num(usual))
 
     @property
     def pads(self) -> list[Mask]:
@@ -263,7 +281,7 @@ class Fit:
         """
         by_gain = common_spread(one[0], other[0], on)
         by_offset = common_spread(one[1], other[1], on)
-        slight = SLIGHT * self.reference.scale.full_scale
+        slight = SLIGHT * self.model.symbols.rest.full
         return bool(by_gain >= np.log(GAIN) / 2 or by_offset >= slight / 2)
 
     def prefers(
@@ -278,7 +296,7 @@ class Fit:
 
         Cells that count as faulty are scored too: wires that are exchanged make them so.
         """
-        everywhere = replace(self, used=self.layout.present.ravel() & (self.reference.dead == 0))
+        everywhere = replace(self, used=self.layout.present.ravel() & self.model.living)
         on = np.any(pads, axis=0)
         ours = 0.0
         for (log_gain, offset), other in zip(of_halves, halves[::-1], strict=True):
@@ -292,110 +310,99 @@ class Fit:
         baseline."""
         offset = self.rest(recordings) - self.least
         log_gain = np.zeros(len(offset))
+        record = self.model.record_of(recordings)
         for _ in range(_ROUNDS):
-            features, _ = self._events(recordings, log_gain, offset)
-            if not len(features):
-                break
-            ratio, variance = self._ratios(features, self._predicted(features))
+            each, precision = self._by_recording(record, log_gain, offset)
+            ratio, variance = _ratios(each, precision)
             for pad in self.pads:
                 on = pad & self.used
                 log_gain[on] += _STEP * (
-                    _shrunk((log_gain + ratio)[on], variance[on]) - log_gain[on]
+                    _shrunk((log_gain + ratio - self.usual)[on], variance[on]) - log_gain[on]
                 )
         return log_gain, offset
 
     def rest(self, recordings: Sequence[Floats]) -> Floats:
         """Return a low quantile of each cell, ``[D]``, less how far noise lowers it that most cells
-        have, beyond that of another gain."""
+        of its pad have, beyond that of another gain."""
         low: Floats = np.quantile(np.concatenate(recordings), LOW, axis=0)
         came = np.maximum(noise_of(recordings) - 2 * self.noise, 0.0)
-        noisier = self.used.any() and np.median(came[self.used]) > 0
-        return low - ndtri(LOW) * came if noisier else low
+        for pad in self.pads:
+            on = pad & self.used
+            if on.any() and np.median(came[on]) > 0:
+                low[pad] -= ndtri(LOW) * came[pad]
+        return low
 
     def scores(self, recordings: Sequence[Floats], log_gain: Floats, offset: Floats) -> Floats:
-        """Return the log pseudo-likelihood of each recording, with the readings corrected."""
-        features, of = self._events(recordings, log_gain, offset)
-        if not len(features):
-            return np.zeros(len(recordings))
-        expected = self._predicted(features)
-        loaded = features[:, 2] > 0
-        never = np.clip(expected.never, 1e-6, 1 - 1e-6)
-        error = np.where(loaded, features[:, 1] - expected.mean, 0.0) / np.nan_to_num(
-            expected.spread, nan=np.inf
-        )
+        """Return the log pseudo-likelihood of a piece of each recording, with the readings
+        corrected."""
+        record = self.model.record_of(recordings)
+        load = self._loads(record, log_gain, offset)
+        mean, surely = self._expected(load)
+        loaded = load > _SHOWN
+        error = np.where(loaded, load - mean, 0.0) / self.model.predictor.error
         # A density of readings: a higher gain spreads them.
         of_load = log_student_t(error, OUTLIERS) - log_gain / 2
-        score = np.where(loaded, np.log1p(-never) + of_load, np.log(never))[:, self.used].sum(
-            axis=1
+        p = np.clip(surely, _RARELY, 1 - _RARELY)
+        score = np.where(loaded, np.log(p) + of_load, np.log1p(-p))[:, self.used].sum(axis=1)
+        pieces = np.bincount(record.recording, minlength=len(recordings))
+        found: Floats = np.bincount(record.recording, score, len(recordings)) / np.maximum(
+            pieces, 1
         )
-        by_recording: Floats = np.bincount(of, score, len(recordings)).astype(np.float64)
-        return by_recording
+        return found
 
-    def _predicted(self, features: Array) -> Prediction:
-        assert self.reference.model is not None
-        return self.reference.model.predict(features, self.used)
+    def _loads(self, record: Record, log_gain: Floats, offset: Floats) -> Array:
+        """Return the root loads of the pieces with the readings corrected, ``[n, D]``."""
+        rest = self.model.symbols.rest
+        above = (record.mean - rest.level - offset) / np.exp(log_gain)
+        return root_load(np.minimum(above, rest.full), rest)
 
-    def _events(
-        self, recordings: Sequence[Floats], log_gain: Floats, offset: Floats
-    ) -> tuple[Array, NDArray[np.intp]]:
-        """Return the features ``[n, 4, D]`` of the events with the readings corrected, and the
-        recording of each."""
-        rest = self.reference.scale.baseline
-        gain = np.exp(log_gain)
-        top = self.layout.full_scale
-        found = [
-            (event.whole.features(), i)
-            for i, recording in enumerate(recordings)
-            for event in contact_events(
-                np.clip((recording - rest - offset) / gain + rest, 0.0, top), self.reference.scale
-            )
-        ]
-        if not found:
-            return np.zeros((0, 4, len(offset)), np.float32), np.zeros(0, np.intp)
-        features, of = zip(*found, strict=True)
-        return np.stack(features), np.array(of)
+    def _expected(self, load: Array) -> tuple[Array, Array]:
+        """Return the root load that is expected of each cell by the others, and how surely it is
+        loaded, ``[n, D]`` each."""
+        return self.model.predictor.mean.predict(load, self.used)
 
     def by_recording(self, recordings: Sequence[Floats]) -> tuple[Floats, Floats]:
         """Return the mean of 2 log(y / m) of each cell in each recording, and its precision,
         ``[n, D]`` each; 0 and 0 where nothing tells it."""
         nothing = np.zeros(self.layout.n_cells)
-        total = np.zeros((len(recordings), self.layout.n_cells))
-        precision = np.zeros_like(total)
-        features, of = self._events(recordings, nothing, nothing)
-        if not len(features):
-            return total, precision
-        ratio, error = self._each_ratio(features, self._predicted(features))
-        weight = 1 / (error**2 + _LEAST_VARIANCE)
-        np.add.at(total, of, weight * np.clip(ratio, -_FARTHEST, _FARTHEST))
-        np.add.at(precision, of, weight)
-        return total / np.maximum(precision, np.finfo(float).tiny), precision
+        return self._by_recording(self.model.record_of(recordings), nothing, nothing)
 
-    def _each_ratio(self, features: Array, expected: Prediction) -> tuple[Floats, Floats]:
-        """Return 2 log(y / m) of each event and its standard error, ``[n, D]`` each; 0 and inf
-        where the cell, or what is expected of it, is hardly loaded."""
-        load = features[:, 1].astype(np.float64)
-        spread = np.nan_to_num(expected.spread, nan=np.inf)
-        shown = (features[:, 3] > 0.5) & (expected.mean > MARGIN * self.reference.scale.root_near)
-        ratio = 2 * np.log(np.maximum(load, 1e-6) / np.maximum(expected.mean, 1e-6))
-        error = 2 * spread / np.maximum(expected.mean, 1e-6)
-        return np.where(shown, ratio, 0.0), np.where(shown, error, np.inf)
+    def _by_recording(
+        self, record: Record, log_gain: Floats, offset: Floats
+    ) -> tuple[Floats, Floats]:
+        """Return what :meth:`by_recording` does, with the readings corrected."""
+        load = self._loads(record, log_gain, offset)
+        mean, _ = self._expected(load)
+        shown = (load > NOTHING) & (mean > _SHOWN) & np.isfinite(self.model.predictor.error)
+        expected = np.maximum(mean, _SHOWN)
+        ratio = 2 * np.log(np.where(shown, load, expected) / expected)
+        error = 2 * self.model.predictor.error / expected
+        weight = np.where(shown, 1 / (error**2 + _LEAST_VARIANCE), 0.0)
+        begins = shown & ~(np.roll(shown, 1, axis=0) & ~record.first[:, None])
+        first = np.flatnonzero(np.diff(record.recording, prepend=-1))
+        weights = np.add.reduceat(weight, first, axis=0)
+        clipped = np.clip(ratio, -_FARTHEST, _FARTHEST)
+        total = np.add.reduceat(weight * clipped, first, axis=0)
+        contacts = np.add.reduceat(begins, first, axis=0, dtype=float)
+        pieces = np.maximum(np.add.reduceat(shown, first, axis=0, dtype=float), 1)
+        found = total / np.maximum(weights, np.finfo(float).tiny)
+        return found, weights * contacts / pieces
 
-    def _ratios(self, features: Array, expected: Prediction) -> tuple[Floats, Floats]:
-        """Return the mean of 2 log(y / m) of each cell, and its variance, ``[D]``; NaN: too few
-        events."""
-        ratio, error = self._each_ratio(features, expected)
-        plain = weight = 1 / error**2
-        mean = np.zeros(ratio.shape[1])
-        for _ in range(10):  # iteratively reweighted
-            mean = (weight * ratio).sum(axis=0) / np.maximum(weight.sum(axis=0), 1e-12)
-            weight = plain * np.minimum(
-                1.0, _WIDE * error / np.maximum(np.abs(ratio - mean), 1e-12)
-            )
-        total = np.maximum(weight.sum(axis=0), 1e-12)
-        variance = np.maximum((weight * (ratio - mean) ** 2).sum(axis=0) / total, _LEAST_VARIANCE)
-        variance *= (weight**2).sum(axis=0) / total**2  # 1 / effective number of events
-        few = (weight > 0).sum(axis=0) < _FEWEST_EVENTS
-        return np.where(few, np.nan, mean), np.where(few, np.nan, variance)
+
+def _ratios(ratio: Floats, precision: Floats) -> tuple[Floats, Floats]:
+    """Return the mean of 2 log(y / m) of each cell over the recordings, ``[n, D]``, and its
+    variance, ``[D]`` each; NaN: too few recordings load it."""
+    weight = precision
+    mean = np.zeros(ratio.shape[1])
+    for _ in range(10):  # iteratively reweighted
+        mean = (weight * ratio).sum(axis=0) / np.maximum(weight.sum(axis=0), 1e-12)
+        away = np.abs(ratio - mean) * np.sqrt(precision)
+        weight = precision * np.minimum(1.0, _WIDE / np.maximum(away, 1e-12))
+    total = np.maximum(weight.sum(axis=0), 1e-12)
+    variance = np.maximum((weight * (ratio - mean) ** 2).sum(axis=0) / total, _LEAST_VARIANCE)
+    variance *= (weight**2).sum(axis=0) / total**2  # 1 / effective number of recordings
+    few = (weight > 0).sum(axis=0) < _FEWEST_LOADED
+    return np.where(few, np.nan, mean), np.where(few, np.nan, variance)
 
 
 def _shrunk(log_gain: Floats, variance: Floats) -> Floats:

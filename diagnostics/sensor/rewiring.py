@@ -2,73 +2,77 @@
 after a repair.
 
 The cells work, but their readings arrive at the wrong index. A permutation P of the wiring is
-scored by the pseudo-likelihood (Besag 1975) of the contact events under the healthy model, with the
-readings put back. A channel j, the readings at one index, may also be faulty:
+scored by the pseudo-likelihood (Besag 1975) of pieces of the log under the model of the array, with
+the readings put back. A channel j, the readings at one index, may also be faulty:
 
-    l(P) = sum_j max[ sum_e w_e log P(what j did in event e | channels that are not faulty),
-                      sum_e w_e log P(what j did in event e | what j did in the other events) - 12 ]
+    l(P) = sum_j max[ sum_t w_t log P(level of j in piece t | channels that are not faulty),
+                      sum_t w_t log P(level of j in piece t | its levels in the other pieces) - 12 ]
 
-what it did: never, sometimes or always loaded, and its load. A faulty channel (the second term is
-larger) says the same of each permutation, and it is no predictor. Which channels are faulty is
-found for each permutation, since those of exchanged lines contradict their neighbours until they
-are put back. It is found step by step, and the present order is scored again with those of its best
-rival.
+A faulty channel (the second term is larger) says the same of each permutation, and it is no
+predictor. Which channels are faulty is found for each permutation, since those of exchanged lines
+contradict their neighbours until they are put back. It is found step by step, and the present order
+is scored again with those of its best rival.
+
+P(level) is half that of the network and half that of the conditional mean alone, which is right of
+objects that the reference did not see as well.
 
 Candidates are exchanges of two rows or two columns of a pad, a pad mirrored along either axis, its
 rows or columns shifted by one, a pad turned by half a turn, one read column by column in place of
 row by row, mirrored or not (a square one is transposed then, or turned by a quarter), and exchanged
-pads. The best is taken, and the search goes on from there, so that combinations are found. A
-permutation is reported if the gain l(P) - l(identity) exceeds 24, is positive without the two
-events that favour it most, exceeds by 12 that of any other candidate that moves some of the same
-cells, is as large for the working channels alone, and explains half of what a random order leaves
-unexplained; w_e = 1 / (1 + k) discounts an event that repeats k earlier ones of the 32 strongest. A
-whole pad that is mirrored or turned must also gain 5 % of what a random order of it loses. Where
-the array is loaded symmetrically two wirings read alike, and nothing is reported. Lines that no
-event loads differently are not distinguished. Where loads are spread widely, as by thick gloves,
-exchanged lines may be named by mistake: the whole sensor has then changed as well.
+pads. The best is taken, and the search goes on from there, so that combinations are found. What
+tells the best one is the pseudo-likelihood and how often each cell has its levels, whatever the
+others do: to the others a mirrored pad looks as if the other one were.
+
+A permutation is reported if the gain l(P) - l(identity) exceeds 24 and two and a half times its
+standard error over the pieces (Vuong 1989), if it exceeds by 12 that of any other candidate that
+moves some of the same cells, is as large for the working channels alone, and explains half of what
+a random order leaves unexplained; w_t = 1 / (1 + k) discounts a piece that repeats k earlier ones;
+the 32 that load most are scored. A whole pad that is mirrored or turned must also gain 5 % of what
+a random order of it loses. Where the array is loaded symmetrically two wirings read alike, and
+nothing is reported. Lines that no piece loads differently are not distinguished. Where loads are
+spread widely, as by thick gloves, exchanged lines may be named by mistake: the whole sensor has
+then changed as well. Objects unlike any of the reference hide exchanged lines.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import combinations
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import expit
 
-from diagnostics.events.contact_events import THE_SAME, count_repeats
-from diagnostics.healthy.model import contact_events
-from diagnostics.healthy.prediction import MIN_P_FLOOR, OUTLIERS, log_student_t
+from diagnostics.model.symbols import NOTHING, root_load
 from diagnostics.preprocessing.levels import CERTAIN_RATIO, MAJORITY
-from diagnostics.preprocessing.offset import levelled, levels_above
-from diagnostics.preprocessing.readings import held
 
 if TYPE_CHECKING:
     from diagnostics.evidence.reference import Reference
-    from diagnostics.healthy.model import HealthyModel
-    from diagnostics.healthy.prediction import Prediction
     from diagnostics.layout import SensorLayout
-    from diagnostics.preprocessing.scale import Scale
+    from diagnostics.model.judge import Model
+    from diagnostics.model.observed import Log
 
-_EVENTS = 32  # contact events that are scored: a size
-_FRAMES = 64  # of an event, evenly spread: a size
-_FEWEST = 4  # events; fewer prove nothing
+_PIECES = 32  # that are scored: a size
+_FEWEST = 4  # pieces; fewer prove nothing
+_THE_SAME = 0.95  # cosine from which on two pieces load the same cells
+_PRIOR = 2.0  # pieces that a usual level is worth
+_IMPOSSIBLE = 0.002
+_LEAST_ERROR = 0.02  # of a root load
+_STEEP = 1.8  # logistic distribution of deviation 1
 # of one kind on a pad, the least expected, whose exchange is tried; on large arrays: sizes
 _LINES = 16
 _FEW_LINES = 4
 _WORK = 6400  # lines times cells, about: a size
-LIMIT = 2 * CERTAIN_RATIO  # log likelihood gained, all events together
-_WITHOUT = 2  # events without which there must be a gain too: one odd contact proves nothing
+LIMIT = 2 * CERTAIN_RATIO  # log likelihood gained, all pieces together
+_ERRORS = 2.5  # standard errors by which the gain of a piece exceeds 0
 # of what a random order of a pad loses: gained where a whole pad is turned; by chance up to 0.03
 _TURNED = 0.05
 _MOST_STEPS = 6  # in which permutations are combined, or the faulty channels found anew: a size
 # log ratio from which on a channel is faulty: of what only a fault explains
 _FAULTY = CERTAIN_RATIO
-_T4_AT_0 = 0.375  # density of Student's t with 4 degrees of freedom at 0
-_LEAST_SPREAD = 0.01  # of a root load: half a converter step of the coarsest
 _ROUNDS = 4  # in which the faulty channels of a permutation are found, at most: a size
 
 Floats = NDArray[np.float64]
@@ -83,14 +87,14 @@ class Rewiring:
     Attributes:
         source: int ``[D]``; cell i of the array now answers at index ``source[i]``.
         steps: what was exchanged, as text, in order.
-        gain: log likelihood gained in the events of the log.
-        events: number of events that were scored.
+        gain: log likelihood gained in the pieces that were scored.
+        pieces: number of these.
     """
 
     source: Cells
     steps: tuple[str, ...]
     gain: float
-    events: int
+    pieces: int
 
     @property
     def reason(self) -> str:
@@ -126,31 +130,21 @@ def find_rewiring(
     """
     if reference.model is None:
         return None
-    present = layout.present.ravel()
-    recordings = levelled(
-        recordings, levels_above(recordings, reference.scale, present, reference.offset)
-    )
-    events, weight = events_of(recordings, reference.scale)
-    if len(events) < _FEWEST:
+    log = reference.model.log_of_record(reference.model.record_of(recordings))
+    whole = np.zeros(layout.n_cells, np.intp)
+    pieces, weight = strongest(log, np.arange(len(log.record)), _PIECES, whole)
+    if len(pieces) < _FEWEST:
         return None
-    # Constant cells may be broken, those that are never at rest loaded by a strap: neither scored
-    # nor predictors.
-    moved = np.ptp(np.concatenate(events), axis=0) > reference.scale.near
-    rested = np.any(
-        [((reference.scale.root_load(r) == 0) & ~np.isnan(r)).any(axis=0) for r in recordings],
-        axis=0,
-    )
-    used = moved & rested
-    test = Test(events, weight, reference.model, reference.scale, present, used)
+    test = Test(reference.model, log, pieces, weight)
     source = np.arange(layout.n_cells)
     anywhere = np.random.default_rng(0).permutation(layout.n_cells)
 
     def at_random(faulty: Mask) -> float:
-        return float(test.score(anywhere, faulty).by_event.sum())
+        return float(test.score(anywhere, faulty).by_piece.sum())
 
     total = 0.0
     steps: list[str] = []
-    now = test.settled(source, test.score(source, ~used))
+    now = test.settled(source, test.score(source, ~test.used))
     for _ in range(_MOST_STEPS):
         candidates = list(candidates_of(layout, now.surplus, source))
         if not candidates:  # one pad without rows and columns
@@ -159,16 +153,18 @@ def find_rewiring(
             test.score(candidate.source, now.faulty & (candidate.source == source))
             for candidate in candidates
         ]
-        sums = np.array([score.by_event.sum() for score in scores])
+        sums = np.array([score.by_piece.sum() for score in scores])
+        working = ~scores[int(sums.argmax())].faulty
+        sums += [test.usually(candidate.source, working) for candidate in candidates]
         best = int(sums.argmax())
         found = test.settled(candidates[best].source, scores[best])
         # The present order may be as good once the channels that are faulty in the other one are
         # left out.
         again = test.settled(source, test.score(source, found.faulty))
-        if again.by_event.sum() > now.by_event.sum():
+        if again.by_piece.sum() > now.by_piece.sum():
             now = again
             continue
-        gain = found.by_event - now.by_event
+        gain = found.by_piece - now.by_piece
         # Where it was exchanged, two lines elsewhere may be exchanged as well.
         moves = candidates[best].source != source
         rivals = [
@@ -184,10 +180,10 @@ def find_rewiring(
         ):
             break
         # The channels that work say so by themselves: no permutation is due to the faulty ones.
-        working = test.of_working(candidates[best].source, found.faulty) - test.of_working(
+        of_working = test.of_working(candidates[best].source, found.faulty) - test.of_working(
             source, found.faulty
         )
-        if not _certain(working):
+        if not _certain(of_working):
             break
         source = candidates[best].source
         total += float(gain.sum())
@@ -199,85 +195,109 @@ def find_rewiring(
     left = now.surplus[~now.faulty[source]].sum()
     if left < MAJORITY * random.surplus[~now.faulty[anywhere]].sum():
         return None  # another sensor
-    return Rewiring(source, tuple(steps), total, len(events))
+    return Rewiring(source, tuple(steps), total, len(test.pieces))
 
 
 def _certain(gain: Floats) -> bool:
-    """Return whether the gains of the events, ``[n]``, prove a permutation, even without the two
-    largest."""
-    return bool(gain.sum() >= LIMIT and np.sort(gain)[:-_WITHOUT].sum() > 0)
+    """Return whether the gains of the pieces, ``[n]``, prove a permutation: not by a few of them
+    (test of Vuong, 1989)."""
+    error = np.sqrt(len(gain)) * gain.std()
+    return bool(gain.sum() >= max(LIMIT, _ERRORS * error))
 
 
 class _Score(NamedTuple):
     """The score of one permutation.
 
     Attributes:
-        by_event: float ``[n]``, weighted log likelihood of each event.
+        by_piece: float ``[n]``, weighted log likelihood of each piece.
         surplus: float ``[D]``, by how much the log likelihood at each place exceeds its
             expectation.
-        faulty: bool ``[D]``, channels that their own readings explain better than those of the
-            others do.
+        refuted: float ``[D]``, by how much more of each channel its own readings explain than those
+            of the others do.
     """
 
-    by_event: Floats
+    by_piece: Floats
     surplus: Floats
-    faulty: Mask
+    refuted: Floats
+
+    @property
+    def faulty(self) -> Mask:
+        """Channels that are surely refuted, bool ``[D]``."""
+        return self.refuted > _FAULTY
 
 
 @dataclass(frozen=True)
 class Test:
-    """Scores permutations on the same events.
+    """Scores permutations on the same pieces of a log.
 
     Attributes:
-        events: frames ``[t, D]`` of each event.
-        weight: float ``[n]``, of each event.
-        model, scale: of the reference.
-        present: bool ``[D]``, where there is a cell.
-        used: bool ``[D]``, channels that are scored: their readings move.
+        model: of the array.
+        log: as it came.
+        pieces: int ``[n]``, those that are scored.
+        weight: float ``[n]``, of each of them.
     """
 
-    events: Sequence[Floats]
+    model: Model
+    log: Log
+    pieces: Cells
     weight: Floats
-    model: HealthyModel
-    scale: Scale
-    present: Mask
-    used: Mask
+
+    @cached_property
+    def used(self) -> Mask:
+        """Channels that are scored, bool ``[D]``: constant ones may be broken, those that are never
+        at rest loaded by a strap."""
+        found: Mask = self.log.far & (self.log.load <= NOTHING).any(axis=0)
+        return found
 
     @cached_property
     def alone(self) -> Floats:
-        """Log likelihood of what each channel did, given its own other events alone, ``[n, D]``."""
-        return _log_likelihood_alone(self._features(np.arange(len(self.used))))
+        """Log likelihood of the level of each channel, given its other pieces alone, ``[n, D]``.
+
+        By Laplace's rule of succession, towards how often all channels have a level.
+        """
+        _, level = self._put_back(np.arange(len(self.used)))
+        every = np.bincount(level[:, self.used].ravel(), minlength=self.model.symbols.n) + 1.0
+        usual = (every / every.sum())[level]
+        same = np.zeros(level.shape)
+        for one in range(self.model.symbols.n):
+            among = level == one
+            same += among * (among.sum(axis=0) - 1)
+        return np.asarray(np.log((same + _PRIOR * usual) / (len(level) - 1 + _PRIOR)))
+
+    def _put_back(self, source: Cells) -> tuple[NDArray[np.float32], NDArray[np.int8]]:
+        """Return the root loads and levels of the pieces with the readings put back, ``[n, D]``
+        each."""
+        rest = self.model.symbols.rest
+        record = replace(self.log.record, mean=self.log.record.mean[self.pieces][:, source])
+        above = rest.above(record, self._offset(source)[self.pieces])
+        nobody = np.zeros(above.shape, bool)
+        return root_load(above, rest), self.model.symbols.levels(record, above, nobody)
 
     @cached_property
-    def _frames(self) -> tuple[Floats, Cells]:
-        """The frames of all events, one after the other ``[T, D]``, and where each event ends."""
-        return np.concatenate(self.events), np.cumsum([len(frames) for frames in self.events])
+    def _offsets(self) -> dict[bytes, NDArray[np.float32]]:
+        """What pads share, by where the cells of each pad come from."""
+        return {}
 
-    @cached_property
-    def _unmoved(self) -> NDArray[np.float32]:
-        """The features of the events as they came, ``[n, 4, D]``."""
-        return self._features_of(np.arange(len(self.used)), self.scale)
-
-    def _features(self, source: Cells) -> NDArray[np.float32]:
-        """Return the features of the events with the readings put back, ``[n, 4, D]``."""
-        moved = np.flatnonzero(source != np.arange(len(source)))
-        features = self._unmoved.copy()
-        features[:, :, moved] = self._features_of(source[moved], self.scale.of(moved))
-        return features
-
-    def _features_of(self, channels: Cells, scale: Scale) -> NDArray[np.float32]:
-        """Return what :meth:`Summary.features` says of some channels, ``[n, 4, channels]``, in all
-        events at once."""
-        frames, ends = self._frames
-        root = scale.root_load(frames[:, channels])
-        first = np.append(0, ends[:-1])
-        lengths = (ends - first)[:, None].astype(np.float32)
-        most = np.maximum.reduceat(root, first, axis=0)
-        # not reduceat: it rounds otherwise
-        total = np.stack([of_event.sum(axis=0) for of_event in np.split(root, ends[:-1])])
-        loaded = np.add.reduceat(root > scale.root_near, first, axis=0, dtype=np.float32)
-        ever = (loaded > 0).astype(np.float32)
-        return np.stack([most, total / lengths, ever, loaded / lengths], axis=1)
+    def _offset(self, source: Cells) -> NDArray[np.float32]:
+        """Return what pads share with the readings put back, ``[pieces, D]``: the same unless cells
+        of other pads come."""
+        rest = self.model.symbols.rest
+        moved = rest.pad[source]
+        if (moved == rest.pad).all():
+            source = np.arange(len(source))
+        key = moved.tobytes()
+        if key not in self._offsets:
+            record = self.log.record
+            put_back = replace(
+                record,
+                low=record.low[:, source],
+                high=record.high[:, source],
+                mean=record.mean[:, source],
+                received=record.received[:, source],
+            )
+            telling = self.model.living & self.log.received[source]
+            self._offsets[key] = rest.shared(put_back, telling).offset
+        return self._offsets[key]
 
     def settled(self, source: Cells, score: _Score) -> _Score:
         """Return the score of one permutation once its faulty channels are no predictors;
@@ -290,116 +310,94 @@ class Test:
         return score
 
     def of_working(self, source: Cells, faulty: Mask) -> Floats:
-        """Return the weighted log likelihood of each event, ``[n]``, of channels that are not
-        ``faulty`` (``[D]``).
+        """Return the weighted log likelihood of each piece, ``[n]``, of channels that are not
+        ``faulty`` (``[D]``)."""
+        likely, _ = self._likely(source, faulty)
+        by_piece: Floats = self.weight * np.where((self.used & ~faulty)[source], likely, 0).sum(1)
+        return by_piece
 
-        That of :meth:`Prediction.log_likelihood`, which trusts the size of a load less.
+    def _likely(self, source: Cells, faulty: Mask) -> tuple[Floats, Floats]:
+        """Return the log likelihood of what each cell did, given the others without the ``faulty``
+        channels, and its expectation, ``[n, D]`` each.
+
+        A load where no cell is, is as good as impossible: so the same readings count for each
+        permutation.
         """
-        features = self._features(source)
-        counted = (self.used & ~faulty)[source]
-        expected = self.model.predict(features, counted & self.present)
-        likely = self._where_cells_are(expected.log_likelihood(features), features)
-        by_event: Floats = self.weight * np.where(counted, likely, 0.0).sum(axis=1)
-        return by_event
+        model = self.model
+        load, level = self._put_back(source)
+        known = (self.used & ~faulty)[source] & model.living
+        begins = np.ones(len(load), bool)  # what a cell read before tells nothing of its place
+        by_network = model.predictor(load, load, begins, known)
+        levels = (by_network + self._of_mean(load, known)) / 2
+        found = np.take_along_axis(levels, level.astype(np.intp)[..., None], 2)[..., 0]
+        impossible = np.where(level > 0, np.log(_IMPOSSIBLE), 0.0)
+        expected = (levels * np.log(levels)).sum(axis=-1)
+        return np.where(model.living, np.log(found), impossible), expected
 
-    def _where_cells_are(self, likely: Floats, features: NDArray[np.float32]) -> Floats:
-        """Return log likelihoods ``[n, D]``; a load where no cell is, is as good as impossible.
+    def _of_mean(self, load: NDArray[np.float32], known: Mask) -> Floats:
+        """Return P(level) ``[n, D, K]`` by the conditional mean alone, which is right of objects
+        that the reference did not see, too."""
+        predictor = self.model.predictor
+        mean, _ = predictor.mean.predict(load, known)
+        error = np.where(np.isfinite(predictor.error), predictor.error, 1.0) + _LEAST_ERROR
+        edges = self.model.symbols.edges
+        below = expit((edges[:, None, None] - mean) * (_STEEP / error))
+        levels = np.diff(below, axis=0, prepend=0.0, append=1.0)
+        rare = np.full((self.model.symbols.n - len(levels), *mean.shape), _IMPOSSIBLE)
+        found = np.concatenate([levels + _IMPOSSIBLE, rare])
+        of_level: Floats = np.moveaxis(found / found.sum(axis=0), 0, -1)
+        return of_level
 
-        So the same readings count for each permutation.
-        """
-        return np.where(
-            self.present, likely, np.where(features[:, 2] > 0, np.log(MIN_P_FLOOR), 0.0)
-        )
+    @cached_property
+    def _usual(self) -> Floats:
+        """Log P(level) of each cell, whatever the others do, ``[D, K]``."""
+        nothing = np.zeros((1, len(self.used)), np.float32)
+        nobody = np.zeros(len(self.used), bool)
+        usual: Floats = np.log(self.model.predictor(nothing, nothing, np.ones(1, bool), nobody)[0])
+        return usual
 
     def score(self, source: Cells, faulty: Mask) -> _Score:
         """Return the score of one permutation; ``faulty`` channels (bool ``[D]``) are no
         predictors."""
-        features = self._features(source)
         used = self.used[source]
-        expected = self.model.predict(features, used & self.present & ~faulty[source])
-        states = expected.states
-        usual = (states * np.log(states)).sum(axis=0)
-        surplus = np.where(used, self.weight @ (expected.log_likelihood(features) - usual), 0.0)
-        likely = self._where_cells_are(_log_likelihood(features, expected), features)
+        likely, expected = self._likely(source, faulty)
+        surplus = np.where(used, self.weight @ (likely - expected), 0.0)
         alone = self.alone[:, source]
-        refuted = used & (self.weight @ (alone - likely) > _FAULTY)
-        explained = np.where(used, np.where(refuted, alone, likely), 0.0)
-        now = np.zeros(len(source), bool)
-        now[source] = refuted
-        return _Score(
-            self.weight * explained.sum(axis=1) - _FAULTY * refuted.sum() / len(explained),
-            surplus,
-            now,
-        )
+        by = np.where(used, self.weight @ (alone - likely), -np.inf)
+        explained = np.where(used, np.where(by > _FAULTY, alone, likely), 0.0)
+        penalty = _FAULTY * (by > _FAULTY).sum() / len(explained)
+        refuted = np.zeros(len(source))
+        refuted[source] = by
+        return _Score(self.weight * explained.sum(axis=1) - penalty, surplus, refuted)
+
+    def usually(self, source: Cells, working: Mask) -> float:
+        """Return the weighted log likelihood of what the ``working`` channels (bool ``[D]``) did
+        where a permutation puts them, whatever the others did: a pad that is mirrored looks to the
+        others as if the other one were."""
+        _, level = self._put_back(source)
+        usual = self._usual[np.arange(len(source)), level]
+        counted = (self.used & working)[source] & self.model.living
+        return float(self.weight @ np.where(counted, usual, 0.0).sum(axis=1))
 
 
-def _log_likelihood(features: NDArray[np.float32], expected: Prediction) -> Floats:
-    """Return the log likelihood of what each cell did, given the others, ``[n, D]``."""
-    state = np.take_along_axis(np.log(expected.states), _state(features)[None], axis=0)[0]
-    log_likely: Floats = state + _log_load(features, expected.mean, expected.spread)
-    return log_likely
-
-
-def _log_likelihood_alone(features: NDArray[np.float32]) -> Floats:
-    """Return the log likelihood of what each channel did, given what it did in the other events,
-    ``[n, D]``.
-
-    Shares of the states by Laplace's rule of succession; loads with the mean and deviation of the
-    others.
-    """
-    did = _state(features)
-    same = np.zeros(did.shape)
-    for state in range(3):
-        among = did == state
-        same += among * (among.sum(axis=0) - 1)
-    load = np.where(did > 0, features[:, 1], 0.0).astype(np.float64)
-    others = (did > 0).sum(axis=0) - (did > 0)
-    some = np.maximum(others, 1)
-    mean = (load.sum(axis=0) - load) / some
-    variance = ((load**2).sum(axis=0) - load**2) / some - mean**2
-    deviation = np.where(others > 1, np.sqrt(np.maximum(variance, 0.0) * (some + 1) / some), np.nan)
-    return np.log((same + 1) / (len(did) + 2)) + _log_load(features, mean, deviation)
-
-
-def _state(features: NDArray[np.float32]) -> NDArray[np.intp]:
-    """Return 0: never, 1: always, 2: sometimes loaded, ``[n, D]``, of features ``[n, 4, D]``."""
-    return np.where(features[:, 2] == 0, 0, np.where(features[:, 3] == 1, 1, 2))
-
-
-def _log_load(features: NDArray[np.float32], mean: Floats, spread: Floats) -> Floats:
-    """Return the log density of the mean root load of the loaded cells, 0 for the others,
-    ``[n, D]``.
-
-    Student's t with 4 degrees of freedom, contaminated by a uniform one; where ``spread`` is NaN,
-    uniform alone.
-    """
-    width = np.maximum(np.nan_to_num(spread, nan=np.inf), _LEAST_SPREAD)
-    density = np.exp(log_student_t((features[:, 1] - mean) / width, 0.0)) * _T4_AT_0 / width
-    contaminated = np.where(np.isfinite(width), (1 - OUTLIERS) * density + OUTLIERS, 1.0)
-    return np.where(features[:, 2] > 0, np.log(contaminated), 0.0)
-
-
-def events_of(
-    recordings: Sequence[NDArray[np.float64]], scale: Scale, *, most: int = _EVENTS
-) -> tuple[list[Floats], Floats]:
-    """Return frames ``[t, D]`` of each of the ``most`` strongest contact events of the log, and the
-    weights ``[n]``."""
-    events = []
-    found = []
-    for recording in recordings:
-        frames = np.nan_to_num(held(recording, np.full(recording.shape[1], np.nan))[1:], nan=0.0)
-        for event in contact_events(frames, scale):
-            own = frames[event.first : event.end]
-            own = own[np.linspace(0, len(own) - 1, min(len(own), _FRAMES)).astype(int)]
-            events.append(event)
-            found.append(own)
-    amplitudes = [event.amplitude(np.ones(len(event.lowest), np.float32)) for event in events]
-    # In time order, and no more: the repeats of a whole log would be counted in a square of its
-    # events.
-    strongest = np.sort(np.argsort(np.negative(amplitudes), kind="stable")[:most]).tolist()
-    return [found[i] for i in strongest], 1 / (
-        1 + count_repeats([events[i] for i in strongest], THE_SAME)
-    )
+def strongest(log: Log, some: Cells, most: int, pad_of: Cells) -> tuple[Cells, Floats]:
+    """Return ``most`` of some pieces of a log and their weights: those that load it most, in turn
+    of each unit and each of its pads. A piece that repeats k earlier ones weighs 1 / (1 + k)."""
+    load = np.where(log.far, log.load, 0)[some]
+    turn = np.full(len(some), len(some))
+    for pad in np.unique(pad_of):
+        on_pad = load[:, pad_of == pad].sum(axis=1)
+        order = np.lexsort((-on_pad, log.record.of_unit[some]))
+        unit = log.record.of_unit[some][order]
+        rank = np.arange(len(some)) - np.searchsorted(unit, unit)
+        turn[order] = np.minimum(turn[order], np.where(on_pad[order] > 0, rank, len(some)))
+    total = load.sum(axis=1)
+    chosen = np.sort(np.lexsort((-total, turn))[: min(most, int((total > 0).sum()))])
+    if not len(chosen):
+        return some[:0], np.zeros(0)
+    unit = load[chosen] / np.linalg.norm(load[chosen], axis=1, keepdims=True)
+    repeats = np.tril(unit @ unit.T >= _THE_SAME, -1).sum(axis=1)
+    return some[chosen], 1 / (1 + repeats)
 
 
 def candidates_of(layout: SensorLayout, surplus: Floats, source: Cells) -> Iterator[_Candidate]:

@@ -1,14 +1,14 @@
 """Wiring that was exchanged in some of the recordings: pads or lines that answer in each other's
 place there, and in their own place in the others.
 
-Each recording is scored by the log likelihood of a few contact events that load each pad most, as
-they came and under each permutation that :mod:`diagnostics.sensor.rewiring` tries. A recording
-counts as exchanged where a permutation gains 24 in it. The permutation with the largest gain over
-these recordings, 192 at least, is told, of all recordings in which it gains, if they then are as
-likely as the others are as they came, by their medians and the range of the others, and if no other
-permutation of the same cells gains nearly as much. At least one recording must contradict it by 24:
-otherwise the whole log may be so. Lines are exchanged in two recordings at least: one may be of an
-odd contact.
+Each recording is scored by the log likelihood of the few pieces that load each pad most, as they
+came and under each permutation that :mod:`diagnostics.sensor.rewiring` tries. A recording counts as
+exchanged where a permutation gains 24 in it. The permutation with the largest gain over these
+recordings, 192 at least, is told, of all recordings in which it gains, if they then are as likely
+as most of the others are as they came: their median is among three quarters of these, or 24 below
+theirs at most. No other permutation of the same cells may gain nearly as much. At least one
+recording must contradict it by 24: otherwise the whole log may be so. Lines are exchanged in two
+recordings at least: one may be of an odd contact.
 
 Not detected: different exchanges in different recordings, and recordings that load both places
 alike.
@@ -23,17 +23,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from diagnostics.preprocessing.levels import CERTAIN_RATIO
-from diagnostics.preprocessing.offset import levelled, levels_above
-from diagnostics.sensor.rewiring import LIMIT, Rewiring, Test, candidates_of, events_of
+from diagnostics.preprocessing.levels import CERTAIN_RATIO, LEAST_LOADED, MAJORITY
+from diagnostics.sensor.rewiring import LIMIT, Rewiring, Test, candidates_of, strongest
 
 if TYPE_CHECKING:
     from diagnostics.evidence.reference import Reference
     from diagnostics.layout import SensorLayout
 
-# contact events, of a recording at most and of all: sizes
-_EVENTS = 4
-_ALL_EVENTS = 160
+# pieces with a load, of a recording at most and of all: sizes
+_PIECES = 4
+_ALL_PIECES = 160
 _FEWEST = 4  # recordings
 # log likelihood gained, all recordings together: of many permutations and recordings, one is odd
 _PROVEN = 8 * LIMIT
@@ -122,7 +121,8 @@ def find_swapped_in_part(
     ]
     if totals[best] - max(rivals, default=0.0) < LIMIT / 2:
         return None
-    if np.median((usual + gains[best])[which]) < np.min(usual[others]):
+    low, middle = np.quantile(usual[others], [LEAST_LOADED, MAJORITY])
+    if np.median((usual + gains[best])[which]) < min(low, middle - LIMIT):
         return None
     recordings_of = tuple(np.flatnonzero(which).tolist())
     return SwappedInPart(
@@ -148,61 +148,44 @@ class _ByRecording:
     """Scores each recording of a log under a permutation.
 
     Attributes:
-        test: of a few events of each recording.
-        recording_of: the recording of each event.
+        test: of a few pieces of each recording.
+        recording_of: int ``[pieces]``, the recording of each.
         n: number of recordings.
     """
 
     test: Test
-    recording_of: list[int]
+    recording_of: Cells
     n: int
 
     @classmethod
     def of(
         cls, recordings: Sequence[Floats], reference: Reference, layout: SensorLayout
     ) -> _ByRecording | None:
-        """Return the scores of a log; None where it has too few recordings with events."""
-        if reference.model is None or len(recordings) < _FEWEST:
+        """Return the scores of a log; None where it has too few recordings with loads."""
+        model = reference.model
+        if model is None or len(recordings) < _FEWEST:
             return None
-        present = layout.present.ravel()
-        levels = levels_above(recordings, reference.scale, present, reference.offset)
-        events: list[Floats] = []
-        of: list[int] = []
-        most = max(2, min(_EVENTS, _ALL_EVENTS // len(recordings)))
-        for i, frames in enumerate(levelled(recordings, levels)):
-            found = _of_each_pad(events_of([frames], reference.scale)[0], most, reference, layout)
-            events += found
-            of += [i] * len(found)
-        if len(set(of)) < _FEWEST:
+        log = model.log_of_record(model.record_of(recordings))
+        most = max(2, min(_PIECES, _ALL_PIECES // len(recordings)))
+        pieces = []
+        weights = []
+        for number in range(len(recordings)):
+            some = np.flatnonzero(log.record.recording == number)
+            chosen, weight = strongest(log, some, most, layout.pad_of)
+            pieces.append(chosen)
+            weights.append(weight)
+        test = Test(model, log, np.concatenate(pieces), np.concatenate(weights))
+        of = log.record.recording[test.pieces]
+        if len(np.unique(of)) < _FEWEST:
             return None
-        moved = np.ptp(np.concatenate(events), axis=0) > reference.scale.near
-        weight = np.ones(len(events))
-        test = Test(events, weight, reference.model, reference.scale, present, moved)
         return cls(test, of, len(recordings))
 
     def likely(self, source: Cells) -> Floats:
-        """Return the log likelihood of each recording, ``[n]``; NaN: it has no event."""
-        by_recording = np.full(self.n, np.nan)
-        of_events = self.test.of_working(source, np.zeros(len(source), bool))
-        for i in set(self.recording_of):
-            by_recording[i] = of_events[np.equal(self.recording_of, i)].sum()
-        return by_recording
-
-
-def _of_each_pad(
-    events: Sequence[Floats], most: int, reference: Reference, layout: SensorLayout
-) -> list[Floats]:
-    """Return up to ``most`` of the events ``[t, D]`` of a recording: in turn those that load each
-    pad most."""
-    if not events:
-        return []
-    loads = np.stack([(frames - reference.scale.baseline).max(axis=0) for frames in events])
-    by_pad = [
-        np.argsort(-loads[:, layout.pad_of == pad].sum(axis=1), kind="stable")
-        for pad in range(layout.pads)
-    ]
-    in_turn = np.stack(by_pad, axis=1).ravel().tolist()
-    return [events[i] for i in list(dict.fromkeys(in_turn))[:most]]
+        """Return the log likelihood of each recording, ``[n]``; NaN: it has no piece with a
+        load."""
+        of_pieces = self.test.of_working(source, np.zeros(len(source), bool))
+        total = np.bincount(self.recording_of, of_pieces, self.n)
+        return np.where(np.bincount(self.recording_of, minlength=self.n) > 0, total, np.nan)
 
 
 def _exchanged(gains: Floats) -> NDArray[np.bool_]:

@@ -15,7 +15,6 @@ from diagnostics import (
 )
 from diagnostics.events.tiled_events import TiledEvents
 from diagnostics.events.tiles import HALO, TILE, tiles
-from diagnostics.healthy.tiled_model import fit_healthy_model
 from diagnostics.preprocessing.readings import RecordingBlocks
 from diagnostics.preprocessing.scale import Scale
 from diagnostics.simulation.injection import bridge
@@ -179,10 +178,9 @@ def test_memory_per_cell_does_not_grow_with_the_array_in_fitting_or_diagnosing()
         recordings = RecordingBlocks(
             [log(layout, 40, seed).astype(np.float32) for seed in range(2)]
         )
-        scale = Scale(np.zeros(layout.n_cells), 0.05, 5.0)
         diagnoser = SelfDiagnosis(layout)
         for work in (
-            lambda: fit_healthy_model(recordings, layout, scale),  # noqa: B023
+            lambda: diagnoser.fit(list(recordings)),  # noqa: B023
             lambda: diagnoser.diagnose(list(recordings)),  # noqa: B023
         ):
             tracemalloc.start()

@@ -8,9 +8,9 @@ import pytest
 
 from diagnostics import Fault, FaultKind, Line, SensorLayout, bridge, inject, line_fault
 from diagnostics.decision.address_aliasing import find_aliasing
+from diagnostics.evidence.cold_start import ColdStream
 from diagnostics.evidence.duplicate_lines import DuplicateLines, DuplicatePair, informative, pairs
 from diagnostics.evidence.reference import Reference
-from diagnostics.evidence.stream_state import StreamState
 from diagnostics.evidence.usual_duplicates import UsualDuplicates
 
 LAYOUT = SensorLayout(2, 6, 5)
@@ -33,8 +33,8 @@ def pressed(seed: int, presses: int = 25) -> np.ndarray:
     return np.concatenate([part for press in log for part in (press, np.zeros((4, 60)))])
 
 
-def state_after(log: np.ndarray) -> StreamState:
-    stream = StreamState(LAYOUT, Reference.unknown(LAYOUT))
+def state_after(log: np.ndarray) -> ColdStream:
+    stream = ColdStream(LAYOUT, Reference.unknown(LAYOUT))
     stream.extend(log)
     return stream.complete()
 
@@ -169,7 +169,7 @@ def test_a_missing_reading_differs_from_nothing_and_a_position_without_a_cell_ne
     present[1, 2, 2] = False
     layout = SensorLayout(2, 6, 5, present=present)
     log[:, layout.cell(1, 2, 2)] = 5.0
-    stream = StreamState(layout, Reference.unknown(layout))
+    stream = ColdStream(layout, Reference.unknown(layout))
     stream.extend(log)
     assert len(stream.complete().duplicates.duplicate_pairs(usual=2)) == 1
 
@@ -185,7 +185,7 @@ def test_lines_that_read_alike_in_the_reference_are_joined_no_more_in_a_log_of_a
 
     def joined(usual: UsualDuplicates, log: np.ndarray) -> list[DuplicatePair]:
         reference = replace(Reference.unknown(LAYOUT), duplicates=usual)
-        stream = StreamState(LAYOUT, reference)
+        stream = ColdStream(LAYOUT, reference)
         stream.extend(log)
         return stream.complete().duplicates.duplicate_pairs(usual.most)
 

@@ -25,15 +25,6 @@ def reference() -> Reference:
     return Reference.fit(healthy(0), LAYOUT)
 
 
-def test_a_fitted_reference_has_a_model_and_one_that_is_not_has_none(reference):
-    unknown = Reference.unknown(LAYOUT)
-    assert unknown.model is None
-    assert (unknown.scale.baseline == 0).all()
-    assert reference.model is not None
-    features = np.zeros((1, 4, CELLS), np.float32)
-    assert reference.model.predict(features, np.ones(CELLS, bool)).never.shape == (1, CELLS)
-
-
 def test_the_tolerance_grows_with_the_converters_step_up_to_a_bound():
     fine, coarse, coarser = (
         Reference.fit(healthy(0, step=step), LAYOUT).tolerance for step in (0.001, 0.03, 0.5)

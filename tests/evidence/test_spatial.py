@@ -4,8 +4,8 @@ import pytest
 from diagnostics.events.constant_runs import ConstantRuns
 from diagnostics.events.contact_events import ContactEvent, Summary
 from diagnostics.evidence.conditional_test import CellState, Model
+from diagnostics.evidence.prediction import Prediction
 from diagnostics.evidence.spatial import Spatial, SpatialTest
-from diagnostics.healthy.prediction import Prediction
 from diagnostics.preprocessing.scale import Array, Scale
 
 CELLS = 8

@@ -14,8 +14,8 @@ from diagnostics import (
     line_fault,
     lose_frames,
 )
+from diagnostics.evidence.cold_start import ColdStream
 from diagnostics.evidence.reference import Reference
-from diagnostics.evidence.stream_state import StreamState
 from diagnostics.faults import Fault
 
 LAYOUT = SensorLayout(2, 6, 5)
@@ -40,14 +40,14 @@ def pressed(presses: int, seed: int = 0) -> np.ndarray:
 
 def remembered(
     log: np.ndarray, size: int | None = None, reference: Reference = UNKNOWN
-) -> StreamState:
-    stream = StreamState(LAYOUT, reference)
+) -> ColdStream:
+    stream = ColdStream(LAYOUT, reference)
     for first in range(0, len(log), size or len(log)):
         stream.extend(log[first : first + (size or len(log))])
     return stream.complete()
 
 
-def differences(a: StreamState, b: StreamState) -> list[str]:
+def differences(a: ColdStream, b: ColdStream) -> list[str]:
     """Return the names of what two states hold differently."""
     pairs = {}
     for part, names in {
@@ -121,7 +121,7 @@ def test_states_of_other_frames_differ():
 
 def test_looking_at_it_in_between_changes_nothing():
     log = broken()[:1800]
-    stream = StreamState(LAYOUT, UNKNOWN)
+    stream = ColdStream(LAYOUT, UNKNOWN)
     for first in range(0, 1800, 29):
         stream.extend(log[first : first + 29])
         completed = stream.complete()
@@ -131,7 +131,7 @@ def test_looking_at_it_in_between_changes_nothing():
 
 def test_completing_a_state_leaves_it_as_it_was():
     log = pressed(3)[:50]
-    stream = StreamState(LAYOUT, UNKNOWN)
+    stream = ColdStream(LAYOUT, UNKNOWN)
     stream.extend(log)
     before = stream.runs
     assert stream.complete().runs.length.max() == 50
@@ -141,7 +141,7 @@ def test_completing_a_state_leaves_it_as_it_was():
 
 def test_a_copy_takes_in_frames_of_its_own():
     log = broken()[:500]
-    stream = StreamState(LAYOUT, UNKNOWN)
+    stream = ColdStream(LAYOUT, UNKNOWN)
     stream.extend(log[:50])
     copy(stream).extend(log[200:300])
     stream.extend(log[50:])
@@ -150,7 +150,7 @@ def test_a_copy_takes_in_frames_of_its_own():
 
 def test_it_stays_of_constant_size_over_a_long_log():
     log = pressed(40)
-    stream = StreamState(LAYOUT, UNKNOWN)
+    stream = ColdStream(LAYOUT, UNKNOWN)
     most = []
     for _ in range(20):
         stream.extend(log)
@@ -183,7 +183,7 @@ def test_accumulated_evidence_ends_with_its_constant_run():
 
 def test_missed_frames_are_counted_and_are_no_evidence_about_cells():
     log = pressed(10)
-    stream = StreamState(LAYOUT, UNKNOWN)
+    stream = ColdStream(LAYOUT, UNKNOWN)
     stream.extend(log[:100])
     stream.miss(5)
     stream.miss(0)
@@ -204,7 +204,7 @@ def test_a_cell_that_delivers_a_reading_now_and_then_was_heard():
 def test_a_frozen_stream_makes_no_cell_constant(grasps: Recordings):
     layout = grasps.layout
     log = np.concatenate([grasps.frames[i] for i in (30, 50, 70)]).astype(float)
-    stream = StreamState(layout, Reference.unknown(layout))
+    stream = ColdStream(layout, Reference.unknown(layout))
     frozen = np.concatenate([log, np.repeat(log[-1:], 3000, axis=0)])
     stream.extend(frozen)
     assert stream.complete().runs.length[log[-1] > 0.3].max() < 200

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import worn
+from conftest import whole_fit, worn
 
 from adaptfault.data.simulated_grasps import simulate
 from diagnostics import SelfDiagnosis, SensorLayout
@@ -13,16 +13,19 @@ from diagnostics import SelfDiagnosis, SensorLayout
 LAYOUT = SensorLayout(2, 6, 5)
 HAND = Path(__file__).resolve().parents[3] / "shared" / "data" / "sdh2x13x6_grasps36.npz"
 GRID = LAYOUT.grid(np.arange(LAYOUT.n_cells))
+# of each class, two thirds are the reference
+DEALT = np.arange(90).reshape(3, 30).T.ravel()
 
 
 @pytest.fixture(scope="module")
 def fitted(small_grasps):
-    return SelfDiagnosis(LAYOUT).fit(small_grasps.frames[:60])
+    with whole_fit():
+        return SelfDiagnosis(LAYOUT).fit([small_grasps.frames[i] for i in DEALT[:60]])
 
 
 def log(small_grasps, seed):
     chosen = 60 + np.random.default_rng(seed).choice(30, 12, replace=False)
-    return [np.asarray(small_grasps.frames[i]) for i in chosen]
+    return [np.asarray(small_grasps.frames[i]) for i in DEALT[chosen]]
 
 
 def exchanged_rows(pad, a, b):
@@ -122,13 +125,18 @@ def test_faulty_cells_that_move_are_no_change_of_the_wiring(fitted, small_grasps
         assert fitted.rewiring(with_faulty(log(small_grasps, seed), cells, kind, seed)) is None
 
 
-@pytest.mark.parametrize(("kind", "seed"), [(MOVING[0], 1), (MOVING[1], 2), (MOVING[2], 2)])
-def test_exchanged_rows_are_named_beside_faulty_cells(fitted, small_grasps, kind, seed):
-    cells = np.random.default_rng(seed).choice(LAYOUT.n_cells, 3, replace=False)
-    broken = with_faulty(log(small_grasps, seed), cells, kind)
-    found = fitted.rewiring([frames[:, exchanged_rows(0, 1, 4)] for frames in broken])
-    assert found is not None
-    assert found.steps == ("rows 1 and 4 of pad 0 are exchanged",)
+@pytest.mark.parametrize("kind", MOVING)
+def test_exchanged_rows_are_mostly_named_beside_faulty_cells_and_no_others(
+    fitted, small_grasps, kind
+):
+    named = []
+    for seed in range(8):
+        cells = np.random.default_rng(seed).choice(LAYOUT.n_cells, 3, replace=False)
+        broken = with_faulty(log(small_grasps, seed), cells, kind)
+        found = fitted.rewiring([frames[:, exchanged_rows(0, 1, 4)] for frames in broken])
+        named += [] if found is None else list(found.steps)
+    assert set(named) == {"rows 1 and 4 of pad 0 are exchanged"}
+    assert len(named) >= 5
 
 
 def test_a_strap_is_no_change_of_the_wiring():
@@ -155,7 +163,8 @@ def test_faulty_cells_of_a_real_hand_are_no_change_of_the_wiring():
             for f, n in zip(given["frames"], given["lengths"], strict=True)
         ]
     order = np.random.default_rng(0).permutation(len(recordings))
-    hand = SelfDiagnosis(layout).fit([recordings[i] for i in order[:300]])
+    with whole_fit():
+        hand = SelfDiagnosis(layout).fit([recordings[i] for i in order[:300]])
     for seed in range(12):
         rng = np.random.default_rng(seed)
         chosen = [recordings[i] for i in rng.choice(order[300:], 30, replace=False)]

@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from diagnostics.healthy.stacking import enclosed
 from diagnostics.preprocessing.baseline import baseline
 from diagnostics.preprocessing.levels import MAJORITY, RARE
 from diagnostics.preprocessing.readings import RecordingBlocks
@@ -74,10 +73,21 @@ def _enclosed_groups(still: NDArray[np.bool_], layout: SensorLayout) -> NDArray[
     bool ``[D]``."""
     moved = layout.grid(~still & layout.present.ravel())
     groups = layout.connected(still)
-    candidates: NDArray[np.bool_] = np.isin(
-        groups, groups[enclosed(moved[..., None]).ravel() & still]
-    )
+    candidates: NDArray[np.bool_] = np.isin(groups, groups[_enclosed(moved).ravel() & still])
     return candidates
+
+
+def _enclosed(moved: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return the cells with cells that ``moved`` on two opposite sides, bool
+    ``[pads, rows, cols]``."""
+    padded = np.pad(moved, ((0, 0), (1, 1), (1, 1)))
+    rows, cols = moved.shape[1:]
+    found = np.zeros_like(moved)
+    for down, right in ((0, 1), (1, 0), (1, 1), (1, -1)):
+        one = padded[:, 1 + down : 1 + down + rows, 1 + right : 1 + right + cols]
+        other = padded[:, 1 - down : 1 - down + rows, 1 - right : 1 - right + cols]
+        found |= one & other
+    return found
 
 
 def _sample(recordings: RecordingBlocks) -> RecordingBlocks:

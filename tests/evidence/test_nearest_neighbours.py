@@ -3,7 +3,7 @@ import pytest
 
 from diagnostics import SensorLayout
 from diagnostics.events.contact_events import ContactEvent, Summary
-from diagnostics.healthy.nearest_neighbours import NearestNeighbours
+from diagnostics.evidence.nearest_neighbours import NearestNeighbours
 from diagnostics.preprocessing.scale import Scale
 
 LAYOUT = SensorLayout(1, 9, 9)

@@ -1,5 +1,5 @@
-"""Prediction: the distribution of the loads of healthy cells in contact events, as a healthy model
-gives it."""
+"""Prediction: the distribution of the loads of healthy cells in contact events, as the
+neighbours of a cell give it."""
 
 from __future__ import annotations
 

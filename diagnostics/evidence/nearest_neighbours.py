@@ -1,5 +1,4 @@
-"""The k-NN spatial model: the healthy model of a cold start, built from the log itself without a
-reference.
+"""The k-NN spatial model of a cold start, built from the log itself without a reference.
 
 Estimates the load of a cell from 20 cells with the most similar surroundings, anywhere on the array
 and in any event. Surroundings are the mean load of the four adjacent predictors, of the four
@@ -22,7 +21,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from diagnostics.healthy.prediction import Prediction
+from diagnostics.evidence.prediction import Prediction
 from diagnostics.layout import SensorLayout
 from diagnostics.preprocessing.scale import Array
 
@@ -58,8 +57,13 @@ class NearestNeighbours:
         return cls(np.stack(parts), layout, rest)
 
     def predict(self, features: Array, predictors: NDArray[np.bool_]) -> Prediction:
-        """See ``HealthyModel.predict``. P(never loaded) is 1 for a cell that no two opposite
-        predictors enclose."""
+        """Predict the loads of healthy cells. P(never loaded) is 1 for a cell that no two opposite
+        predictors enclose.
+
+        Args:
+            features: ``[n, 4, D]``, of n excerpts (see ``Summary.features``).
+            predictors: bool ``[D]``, the cells whose readings may be used.
+        """
         shape = (len(features), features.shape[2])
         never = np.ones(shape)
         always = np.ones(shape)

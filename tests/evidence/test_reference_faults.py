@@ -5,7 +5,7 @@ import pytest
 
 from adaptfault.data.simulated_grasps import simulate
 from diagnostics import Diagnosis, Fault, FaultKind, SelfDiagnosis, SensorLayout, Verdict, inject
-from diagnostics.healthy.reference_faults import find_reference_faults
+from diagnostics.evidence.reference_faults import find_reference_faults
 from diagnostics.preprocessing.readings import RecordingBlocks
 from diagnostics.preprocessing.tolerance import tolerance_of
 

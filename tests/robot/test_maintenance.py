@@ -185,8 +185,7 @@ def test_single_readings_outside_the_range_are_missing_and_counted(
 def test_recovered_cells_lead_back_to_the_version_that_uses_them(bundle, later_grasps, broken_row):
     assert maintain(bundle, broken(later_grasps, broken_row)).version == 2
     bundle.confirm()
-    third = len(later_grasps) // 3
-    reports = [maintain(bundle, later_grasps[i * third : (i + 1) * third]) for i in range(3)]
+    reports = [maintain(bundle, later_grasps[i::3]) for i in range(3)]
     assert [len(r.fault_set) for r in reports] == [5, 5, 0]
     assert (reports[-1].decision, reports[-1].version, reports[-1].exit_code) == (
         "deployed",

@@ -31,7 +31,8 @@ the 32 that load most are scored. A whole pad that is mirrored or turned must al
 a random order of it loses. Where the array is loaded symmetrically two wirings read alike, and
 nothing is reported. Lines that no piece loads differently are not distinguished. Where loads are
 spread widely, as by thick gloves, exchanged lines may be named by mistake: the whole sensor has
-then changed as well. Objects unlike any of the reference hide exchanged lines.
+then changed as well. Objects unlike any of the reference hide exchanged lines; so does a coarser
+converter, or one that loads drive to its top.
 """
 
 from __future__ import annotations
@@ -60,7 +61,6 @@ _FEWEST = 4  # pieces; fewer prove nothing
 _THE_SAME = 0.95  # cosine from which on two pieces load the same cells
 _PRIOR = 2.0  # pieces that a usual level is worth
 _IMPOSSIBLE = 0.002
-_LEAST_ERROR = 0.02  # of a root load
 _STEEP = 1.8  # logistic distribution of deviation 1
 # of one kind on a pad, the least expected, whose exchange is tried; on large arrays: sizes
 _LINES = 16
@@ -131,6 +131,8 @@ def find_rewiring(
     if reference.model is None:
         return None
     log = reference.model.log_of_record(reference.model.record_of(recordings))
+    if log.step or log.saturated:
+        return None
     whole = np.zeros(layout.n_cells, np.intp)
     pieces, weight = strongest(log, np.arange(len(log.record)), _PIECES, whole)
     if len(pieces) < _FEWEST:
@@ -339,7 +341,7 @@ class Test:
         that the reference did not see, too."""
         predictor = self.model.predictor
         mean, _ = predictor.mean.predict(load, known)
-        error = np.where(np.isfinite(predictor.error), predictor.error, 1.0) + _LEAST_ERROR
+        error = np.where(np.isfinite(predictor.error), predictor.error, 1.0)
         edges = self.model.symbols.edges
         below = expit((edges[:, None, None] - mean) * (_STEEP / error))
         levels = np.diff(below, axis=0, prepend=0.0, append=1.0)

@@ -11,7 +11,7 @@ recording must contradict it by 24: otherwise the whole log may be so. Lines are
 recordings at least: one may be of an odd contact.
 
 Not detected: different exchanges in different recordings, and recordings that load both places
-alike.
+alike; nor any behind a coarser converter, or one that loads drive to its top.
 """
 
 from __future__ import annotations
@@ -166,6 +166,8 @@ class _ByRecording:
         if model is None or len(recordings) < _FEWEST:
             return None
         log = model.log_of_record(model.record_of(recordings))
+        if log.step or log.saturated:
+            return None
         most = max(2, min(_PIECES, _ALL_PIECES // len(recordings)))
         pieces = []
         weights = []

@@ -478,8 +478,8 @@ def test_a_log_too_short_for_two_halves_names_exchanged_rows_and_how_many_record
 
 @pytest.mark.usefixtures("worthwhile")
 def test_the_next_run_starts_from_the_undone_wiring(bundle, later_grasps, broken_row):
-    maintain(bundle, exchanged_rows(later_grasps[:12], bundle))
-    again = maintain(bundle, exchanged_rows(broken(later_grasps[12:], broken_row), bundle))
+    maintain(bundle, exchanged_rows(later_grasps[:16], bundle))
+    again = maintain(bundle, exchanged_rows(broken(later_grasps[16:], broken_row), bundle))
     assert again.rewiring == ()
     assert again.fault_set == set(broken_row.cells)
     repaired = maintain(bundle, later_grasps)  # somebody mended the cable
@@ -509,9 +509,9 @@ def test_exchanged_rows_that_cost_no_accuracy_are_told_and_nothing_is_deployed(
 
 
 def test_a_wiring_that_was_rolled_back_is_not_deployed_again(bundle, later_grasps, worthwhile):
-    assert maintain(bundle, exchanged_rows(later_grasps[:12], bundle)).decision == "deployed"
+    assert maintain(bundle, exchanged_rows(later_grasps[:16], bundle)).decision == "deployed"
     bundle.rollback()
-    report = maintain(bundle, exchanged_rows(later_grasps[12:], bundle))
+    report = maintain(bundle, exchanged_rows(later_grasps[16:], bundle))
     assert (report.decision, report.version) == ("kept", 1)
     assert "rolled back before" in report.reason
 

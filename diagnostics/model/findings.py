@@ -20,8 +20,9 @@ from diagnostics.model.objects import judged_with_objects
 from diagnostics.model.observed import HELD, Log
 from diagnostics.model.record import Mask
 from diagnostics.model.symbols import NOTHING
-from diagnostics.model.ways import DRIFTS, WAYS
+from diagnostics.model.ways import DRIFTS, FLOATS, WAYS
 from diagnostics.model.ways.comes_and_goes import COMES_AND_GOES
+from diagnostics.model.ways.floats import floats_lately
 from diagnostics.model.ways.holds import expected
 from diagnostics.preprocessing.levels import CERTAIN_RATIO, DOUBTED, RARE
 
@@ -194,10 +195,8 @@ def shown(judgement: Judgement) -> Mask:
     observed = judgement.observed
     units = judgement.units
     later_half = len(observed.log.record) - units.begins[len(units.begins) // 2]
-    lately = [way.lately(observed, units) for way in WAYS if way.lately is not None]
-    follows = (np.array(lately) < -_SHOWN).all(axis=0) & (observed.log.run < later_half)
-    floats = [way.kind is FaultKind.FLOATING for way in WAYS]
-    follows &= (judgement.evidence[floats] < -_SHOWN).all(axis=0)
+    follows = (floats_lately(observed, units) < -_SHOWN) & (observed.log.run < later_half)
+    follows &= judgement.evidence[WAYS.index(FLOATS)] < -_SHOWN
     found: Mask = follows & (judgement.evidence.max(axis=0) < _SHOWN) & ~judgement.failing.doubted
     return found
 

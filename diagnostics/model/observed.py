@@ -72,7 +72,7 @@ class Log:
         wider = unsure > rest.near
         self.saturated = rest.saturates(record, self.above, telling & self.far)
         self.disturbed: Mask = shared.unseen | rest.noisier(noise)
-        if self.step or self.saturated:
+        if self.is_coarse:
             self.disturbed = np.ones_like(self.disturbed)
         self.above = np.where(wider & (np.abs(self.above) <= unsure), 0, self.above)
         self.value = _held(record.mean, DITHER * rest.full)
@@ -99,6 +99,11 @@ class Log:
         self.overloaded: Mask = self.far & ends_at_top & self.saturated
         at_end = np.logical_and.accumulate(np.flip(self.holds, 0), 0)
         self.run = at_end.sum(axis=0)
+
+    @property
+    def is_coarse(self) -> bool:
+        """Whether readings tell loads less finely than in the reference."""
+        return bool(self.step or self.saturated)
 
     def alone(self, predictor: Predictor) -> Array:
         """Return log P(observed level) ``[n, D]`` by what each cell read a piece ago, nobody

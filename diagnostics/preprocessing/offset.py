@@ -185,29 +185,6 @@ def levelled(recordings: Sequence[Floats], level: Floats) -> RecordingBlocks:
     )
 
 
-def levels_above(
-    recordings: Sequence[Floats], scale: Scale, present: NDArray[np.bool_], usual: ReferenceOffset
-) -> Floats:
-    """Return the level of each recording of a log above the baseline of the reference,
-    ``[recordings]``.
-
-    0 where the reference rests at one level, and where nearly all cells are loaded.
-
-    Args:
-        recordings: ``[T, D]`` each.
-        scale: of the reference.
-        present: bool ``[D]``.
-        usual: common offsets of the reference.
-    """
-    readings = RecordingBlocks.of(recordings)
-    if usual.levels == 0:
-        return np.zeros(len(readings))
-    cells = spread(np.flatnonzero(present))
-    above = _lows(readings, range(len(readings)), cells) - scale.baseline[cells]
-    level = usual.excess([least_loaded(of_recording) for of_recording in above])
-    return np.where(level < usual.limit(scale.full_scale), level, 0.0)
-
-
 def _lows(readings: RecordingBlocks, which: range, cells: NDArray[np.intp]) -> Floats:
     """Return the low quantile of the readings of each of the ``cells``, ``[which, cells]``; NaN
     where one misses."""

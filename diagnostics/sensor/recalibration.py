@@ -160,7 +160,7 @@ def find_recalibration(
     # in order of time: the first half was learned from the even recordings, and scored the others
     gained = gained[..., np.argsort(np.r_[1 : len(new) : 2, : len(new) : 2])]
     best = gained.mean(axis=2).argmax(axis=0)
-    certain = [i for i in range(len(differing)) if _certain(gained[best[i], i])]
+    certain = [i for i in range(len(differing)) if mean_is_positive(gained[best[i], i])]
     if not certain:
         return None
     log_gain, offset = fit.learned(new)
@@ -219,7 +219,7 @@ def common_spread(one: Floats, other: Floats, on: Mask) -> float:
     return float(np.sqrt(max(np.median(products), 0.0))) / _MEDIAN_DEVIATION
 
 
-def _certain(gained: Floats, errors: float = _ERRORS) -> bool:
+def mean_is_positive(gained: Floats, errors: float = _ERRORS) -> bool:
     """Return whether the mean of values ``[n]`` is positive by more than so many standard
     errors."""
     error = gained.std(ddof=1) / np.sqrt(len(gained))
@@ -229,7 +229,7 @@ def _certain(gained: Floats, errors: float = _ERRORS) -> bool:
 def _throughout(gained: Floats) -> bool:
     """Return whether values ``[n]``, in order of time, are positive in each half of them."""
     older, newer = np.array_split(gained, 2)
-    return _certain(older, _ERRORS / 2) and _certain(newer, _ERRORS / 2)
+    return mean_is_positive(older, _ERRORS / 2) and mean_is_positive(newer, _ERRORS / 2)
 
 
 @dataclass(frozen=True)

@@ -49,6 +49,7 @@ from scipy.special import expit
 
 from diagnostics.model.symbols import NOTHING, root_load
 from diagnostics.preprocessing.levels import CERTAIN_RATIO, MAJORITY
+from diagnostics.sensor.recalibration import mean_is_positive
 
 if TYPE_CHECKING:
     from diagnostics.evidence.reference import Reference
@@ -131,7 +132,7 @@ def find_rewiring(
     if reference.model is None:
         return None
     log = reference.model.log_of_record(reference.model.record_of(recordings))
-    if log.step or log.saturated:
+    if log.is_coarse:
         return None
     whole = np.zeros(layout.n_cells, np.intp)
     pieces, weight = strongest(log, np.arange(len(log.record)), _PIECES, whole)
@@ -157,7 +158,7 @@ def find_rewiring(
         ]
         sums = np.array([score.by_piece.sum() for score in scores])
         working = ~scores[int(sums.argmax())].faulty
-        sums += [test.usually(candidate.source, working) for candidate in candidates]
+        sums += [score.usual[working].sum() for score in scores]
         best = int(sums.argmax())
         found = test.settled(candidates[best].source, scores[best])
         # The present order may be as good once the channels that are faulty in the other one are
@@ -203,8 +204,7 @@ def find_rewiring(
 def _certain(gain: Floats) -> bool:
     """Return whether the gains of the pieces, ``[n]``, prove a permutation: not by a few of them
     (test of Vuong, 1989)."""
-    error = np.sqrt(len(gain)) * gain.std()
-    return bool(gain.sum() >= max(LIMIT, _ERRORS * error))
+    return bool(gain.sum() >= LIMIT) and mean_is_positive(gain, _ERRORS)
 
 
 class _Score(NamedTuple):
@@ -212,6 +212,8 @@ class _Score(NamedTuple):
 
     Attributes:
         by_piece: float ``[n]``, weighted log likelihood of each piece.
+        usual: float ``[D]``, log likelihood of what each channel did where the permutation puts it,
+            whatever the others did: to them a mirrored pad looks as if the other one were.
         surplus: float ``[D]``, by how much the log likelihood at each place exceeds its
             expectation.
         refuted: float ``[D]``, by how much more of each channel its own readings explain than those
@@ -219,6 +221,7 @@ class _Score(NamedTuple):
     """
 
     by_piece: Floats
+    usual: Floats
     surplus: Floats
     refuted: Floats
 
@@ -314,13 +317,13 @@ class Test:
     def of_working(self, source: Cells, faulty: Mask) -> Floats:
         """Return the weighted log likelihood of each piece, ``[n]``, of channels that are not
         ``faulty`` (``[D]``)."""
-        likely, _ = self._likely(source, faulty)
+        likely, _, _ = self._likely(source, faulty)
         by_piece: Floats = self.weight * np.where((self.used & ~faulty)[source], likely, 0).sum(1)
         return by_piece
 
-    def _likely(self, source: Cells, faulty: Mask) -> tuple[Floats, Floats]:
+    def _likely(self, source: Cells, faulty: Mask) -> tuple[Floats, Floats, Floats]:
         """Return the log likelihood of what each cell did, given the others without the ``faulty``
-        channels, and its expectation, ``[n, D]`` each.
+        channels, its expectation, and that of what it did whatever the others did, ``[n, D]`` each.
 
         A load where no cell is, is as good as impossible: so the same readings count for each
         permutation.
@@ -334,7 +337,8 @@ class Test:
         found = np.take_along_axis(levels, level.astype(np.intp)[..., None], 2)[..., 0]
         impossible = np.where(level > 0, np.log(_IMPOSSIBLE), 0.0)
         expected = (levels * np.log(levels)).sum(axis=-1)
-        return np.where(model.living, np.log(found), impossible), expected
+        usual = self._usual[np.arange(len(source)), level]
+        return np.where(model.living, np.log(found), impossible), expected, usual
 
     def _of_mean(self, load: NDArray[np.float32], known: Mask) -> Floats:
         """Return P(level) ``[n, D, K]`` by the conditional mean alone, which is right of objects
@@ -362,7 +366,7 @@ class Test:
         """Return the score of one permutation; ``faulty`` channels (bool ``[D]``) are no
         predictors."""
         used = self.used[source]
-        likely, expected = self._likely(source, faulty)
+        likely, expected, usual = self._likely(source, faulty)
         surplus = np.where(used, self.weight @ (likely - expected), 0.0)
         alone = self.alone[:, source]
         by = np.where(used, self.weight @ (alone - likely), -np.inf)
@@ -370,16 +374,10 @@ class Test:
         penalty = _FAULTY * (by > _FAULTY).sum() / len(explained)
         refuted = np.zeros(len(source))
         refuted[source] = by
-        return _Score(self.weight * explained.sum(axis=1) - penalty, surplus, refuted)
-
-    def usually(self, source: Cells, working: Mask) -> float:
-        """Return the weighted log likelihood of what the ``working`` channels (bool ``[D]``) did
-        where a permutation puts them, whatever the others did: a pad that is mirrored looks to the
-        others as if the other one were."""
-        _, level = self._put_back(source)
-        usual = self._usual[np.arange(len(source)), level]
-        counted = (self.used & working)[source] & self.model.living
-        return float(self.weight @ np.where(counted, usual, 0.0).sum(axis=1))
+        usually = np.zeros(len(source))
+        usually[source] = np.where(used & self.model.living, self.weight @ usual, 0.0)
+        by_piece = self.weight * explained.sum(axis=1) - penalty
+        return _Score(by_piece, usually, surplus, refuted)
 
 
 def strongest(log: Log, some: Cells, most: int, pad_of: Cells) -> tuple[Cells, Floats]:

@@ -166,7 +166,7 @@ class _ByRecording:
         if model is None or len(recordings) < _FEWEST:
             return None
         log = model.log_of_record(model.record_of(recordings))
-        if log.step or log.saturated:
+        if log.is_coarse:
             return None
         most = max(2, min(_PIECES, _ALL_PIECES // len(recordings)))
         pieces = []

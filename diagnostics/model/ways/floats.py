@@ -59,8 +59,9 @@ def _since(observed: Observed, units: Units) -> Cells:
     return since(_ratio(observed), units)
 
 
-def _lately(observed: Observed, units: Units) -> Array:
+def floats_lately(observed: Observed, units: Units) -> Array:
+    """Return the evidence ``[D]`` that a cell floats in the later half of a log."""
     return since_middle(_ratio(observed), units)
 
 
-FLOATS = Way(FaultKind.FLOATING, 0.2, _evidence, _since, lately=_lately)
+FLOATS = Way(FaultKind.FLOATING, 0.2, _evidence, _since)

@@ -25,8 +25,6 @@ class Way:
         since: likeliest first piece of the fault, int ``[D]``; None: the first one.
         value: what is told of it, ``[D]``: a load, or frames; None: the reading at the end.
         decides: whether it tells who is trusted, in every round.
-        lately: evidence of the fault in the later half of the log, ``[D]``, of a way that a cell
-            must deny there to be alive; None: of another one.
         floats: whether such a cell moves by itself as well: there is no more evidence of it than of
             that.
     """
@@ -38,7 +36,6 @@ class Way:
     value: Callable[[Observed], Array] | None = None
     decides: bool = True
     floats: bool = False
-    lately: Callable[[Observed, Units], Array] | None = None
 
 
 def asked_once(found: Callable[..., Array]) -> Callable[..., Array]:

@@ -13,9 +13,9 @@ tested again.
 
 That nothing touches a pad is no surprise: cells of others tell of no line.
 
-Not detected: a line with fewer than three cells that move, or without others on its pad that tell
-of its load; one whose cells keep a load or another rest while it is away. A line that breaks once
-and for all is found by the values that its cells hold.
+Not detected: a line with fewer than three cells that move, or one of which carries most of its
+load; one without others on its pad that tell of it; one whose cells keep a load or another rest
+while it is away. A line that breaks once and for all is found by the values that its cells hold.
 """
 
 from __future__ import annotations
@@ -39,6 +39,7 @@ from diagnostics.wiring import LineKind
 
 FEWEST = 3  # cells that tell of a line
 _KINDS: tuple[LineKind, ...] = ("row", "column", "converter", "position", "bus", "group")
+_MOSTLY = 0.5  # of the load of a line
 _BLOCK = 8  # units of a long recording that count as one
 _LEVELS = 16  # of the expected load
 _BESIDE = (0.01, 0.34, 0.67, 0.99)  # shares of the cells beside it, between levels
@@ -134,6 +135,7 @@ class Lines:
         beside: bool ``[W, D]``, cells beside these that are not.
         others: bool ``[W, D]``, all other living cells of its pads.
         predicted: expected loads between levels.
+        usual: ``[D]``, mean load of each cell in the reference.
         resting: P(at rest | context) ``[1, W, M]``; while the model is fitted ``[halves, W, M]``,
             without each half of the recordings.
         half: int ``[n]``, of each piece, while the model is fitted; else empty.
@@ -145,6 +147,7 @@ class Lines:
     on: Mask
     beside: Mask
     others: Mask
+    usual: Array
     predicted: Array
     resting: Array
     half: Cells
@@ -227,7 +230,8 @@ class Lines:
             opens.append(blocks.of_units(beyond).sum(axis=0))
         under_load = logsumexp(opens, axis=0) - np.log(_LIMITS)
         evidence = np.maximum(of_blocks.sum(axis=0), under_load)
-        enough = (self.on & eligible).sum(axis=1) >= FEWEST
+        of = self.on & eligible
+        enough = (of.sum(axis=1) >= FEWEST) & carried_by_several(self.usual * of)
         enough &= (self.beside & known).sum(axis=1) >= _TELL * self.beside.sum(axis=1)
         enough &= evidence > for_good(ratio, blocks)
         return np.where(enough, evidence, 0), of_blocks, ratio, blocks
@@ -350,7 +354,8 @@ def fit_lines(
     odd = np.full(len(on), _RARELY, np.float32)
     zero = np.zeros(len(on), np.float32)
     table = np.zeros((1, len(on), 0), np.float32)
-    blank = Lines(on, beside, others, zero, table, NO_HALF, odd, zero, 1)
+    usual = load.mean(axis=0)
+    blank = Lines(on, beside, others, usual, zero, table, NO_HALF, odd, zero, 1)
     means = blank.means(load, on)
     rests = means <= NOTHING
     expected = np.zeros(means.shape)
@@ -400,6 +405,13 @@ def _resting(counts: Floats) -> Array:
     usual = (pooled[:, 1] + 0.5) / (pooled.sum(axis=1) + 1)
     own = (counts[..., 1] + _ALL_LINES * usual) / (counts.sum(axis=2) + _ALL_LINES)
     found: Array = np.clip(own, _GUESS, 1 - _GUESS).astype(np.float32)
+    return found
+
+
+def carried_by_several(usual: Array) -> Mask:
+    """Return whether no cell carries most of the ``usual`` load of its line (``[W, D]``, 0 off it),
+    bool ``[W]``: else the line does what that cell does."""
+    found: Mask = usual.max(axis=1, initial=0) < _MOSTLY * usual.sum(axis=1)
     return found
 
 

@@ -3,11 +3,12 @@
 For pad p and piece t, with r the rest of each cell and d what it drifted by since the reference::
 
     c_p(t) = w m + (1 - w) c_p(before or after),
-    m = middle of the shortest interval that holds half of (reading - r - d) over the cells of the
-        pad (shorth, Andrews et al. 1972),
+    m = middle of the shortest interval that holds half of (reading - r - d) / a over the cells of
+        the pad (shorth, Andrews et al. 1972),
     w = 1 where it is narrow, 0 where it is twice as wide
 
-Cell i shows a share a_i of it, learned from the reference and from the log. It is subtracted where
+Cell i shows a share a_i of it, learned from the reference and then, in turn with c, from the log:
+rank one, by alternating least squares. It is subtracted where
 the interval is narrow, compared with m: no contact is so even. A contact with most of a pad hides
 what it shares; then that is what it shared before or after it in the same recording. All cells of
 the pad tell, constant ones as well, but at either end of the converter: those that are trusted
@@ -43,6 +44,7 @@ _RESTS = 0.25  # share of the recordings in which a cell rests at some time, at 
 _WIDER = 8.0  # than their interval is the spread of all, where these rest and others do not
 _LASTS = 0.25  # share of the pieces in which a pad has drifted, at least
 _ROUNDS = 3
+_IN_TURN = 2
 _SURE = 20.0  # pieces that a share of 1 is worth
 _MOST = 2.0  # share of the offset of a pad that a cell shows in a log; in the reference 1
 _BLOCK = 64  # pieces of a recording that are looked at as one
@@ -57,7 +59,8 @@ _NOISIER = 2.0  # times as noisy, or coarse, as the reference
 _UNSEEN = 1.5  # times what the reference usually shows: it never saw as much
 _FEWEST_STEPS = 3  # between the readings of a cell that has steps
 _APART = 10.0  # times what n readings of a range are apart at least, range / n^2: by steps
-_SATURATES = 0.1  # of the loaded readings of a usual cell are at the top
+_SATURATES = 0.1  # of the loaded readings of a cell are at the top
+_SOME = 0.25  # of the cells: those that loads bring to the top
 _WITHIN = 4.0  # standard deviations
 _UNSTEADY = 0.05  # of full scale: the rest of a cell differs between recordings by less
 
@@ -95,7 +98,7 @@ class Rest:
         settles: bool ``[D]``, cells that come to rest in nearly all recordings of the reference.
         pressed: bool ``[D]``, cells of pads that a contact loads as a whole, and as evenly.
         step: of the converter.
-        at_top: share of the loaded readings of a usual cell that are at the top.
+        at_top: share of the loaded readings that are at the top, see :meth:`share_at_top`.
     """
 
     level: Array
@@ -122,11 +125,14 @@ class Rest:
         """Return what the pads of a log share; ``telling``: bool ``[D]``, cells that are received
         and live."""
         drift = self.drift(record, telling)
-        of_pads = self.of_pads(record, telling, drift)
-        share = _share(record.mean - self.level - drift, of_pads, self.near, self.share)
-        # what the reference shows tells more, unless it never saw as much
-        unseen = _usually(of_pads, _OFTEN) > _UNSEEN * self.offsets
-        share = np.where(unseen, share, self.share).astype(np.float32)
+        above = record.mean - self.level - drift
+        share = self.share
+        for _ in range(_IN_TURN):
+            of_pads = replace(self, share=share).of_pads(record, telling, drift)
+            own = _share(above, of_pads, self.near, self.share)
+            # on a pad that shares no more than in the reference, one that does not follow is odd
+            unseen = _usually(of_pads, _OFTEN) > _UNSEEN * self.offsets
+            share = np.where(unseen | (own > _EVEN * self.share), own, self.share)
         unseen |= (drift != 0).mean(axis=0) > _LASTS
         return Shared(drift, drift + share * of_pads, unseen)
 
@@ -147,7 +153,10 @@ class Rest:
                 tell = live
             if len(tell) < _FEWEST:
                 continue
-            of_pad = np.sort(np.where(at_end[:, tell], np.nan, above[:, tell]), axis=1)
+            # in units of a usual cell: else all shares shrink, and what they are of grows
+            of_usual = self.share[tell] / np.median(self.share[tell])
+            alike = above[:, tell] / of_usual
+            of_pad = np.sort(np.where(at_end[:, tell], np.nan, alike), axis=1)
             noise = float(np.median(self.near[tell]))
             finest = max(self.least, min(noise, float(np.median(self.noise[tell]))))
             middle, weight, surely = _even(of_pad, noise, finest)
@@ -252,13 +261,15 @@ class Rest:
         return self.share_at_top(record, above, telling) > _SATURATES + _NOISIER * self.at_top
 
     def share_at_top(self, record: Record, above: Array, telling: Mask) -> float:
-        """Return the share of the loaded readings of a usual cell that are at the top; arguments as
-        for :meth:`noise_of`."""
+        """Return the share of the loaded readings that are at the top: a quarter of the cells have
+        it at least; arguments as for :meth:`noise_of`."""
         top = record.mean >= self.full * (1 - DITHER)
         count = (top | (above > self.near)).sum(axis=0)
-        used = telling & (count > 0) & ~top[-1]  # at the end, it may be stuck there
+        returns = (top[:-1] & ~top[1:]).any(axis=0)
+        stuck = top[-1] & ~returns
+        used = telling & (count > 0) & ~stuck
         shares = top.sum(axis=0)[used] / count[used]
-        return float(np.median(shares)) if used.any() else 0.0
+        return float(np.quantile(shares, 1 - _SOME)) if used.any() else 0.0
 
     def noise_of(self, record: Record, above: Array, telling: Mask) -> Array:
         """Return how far a cell reads from rest by noise, ``[D]``.

@@ -41,7 +41,12 @@ def _noise(whole: np.ndarray) -> np.ndarray:
     return whole + np.random.default_rng(7).normal(0, 60, whole.shape)
 
 
-DISTURBANCES = [_hum, _ramp, _coarse, _saturates, _crosstalk, _noise]
+def _vibrates(whole: np.ndarray) -> np.ndarray:
+    share = np.random.default_rng(5).uniform(0.5, 1.5, whole.shape[1])
+    return whole + 80 * share * (1 + np.sin(_time(whole) / 1.3))
+
+
+DISTURBANCES = [_hum, _ramp, _coarse, _saturates, _crosstalk, _noise, _vibrates]
 Disturb = Callable[[np.ndarray], np.ndarray]
 
 

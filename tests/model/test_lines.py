@@ -10,7 +10,7 @@ from pressed_recordings import FRAMES, LAYOUT, REST, presses
 
 from diagnostics import FaultKind, Line, SelfDiagnosis, SensorLayout, Verdict
 from diagnostics.model.conditional_mean import ConditionalMean, Tile
-from diagnostics.model.lines import cells_on
+from diagnostics.model.lines import carried_by_several, cells_on
 from diagnostics.simulation.circuit import Circuit, StuckCell
 
 LENGTH = 30  # frames of a press
@@ -65,6 +65,18 @@ def test_lines_of_fewer_than_three_living_cells_tell_nothing():
     assert len(on) == 15
     assert on.sum(axis=1).min() >= 3
     assert not on[:, ~living].any()
+
+
+@given(
+    loads=st.lists(st.floats(0.6, 1), min_size=3, max_size=12),
+    scale=st.floats(0.01, 10),
+    others=st.integers(0, 5),
+)
+def test_cells_that_are_hardly_loaded_make_no_line_of_one_that_is(loads, scale, others):
+    alike = np.array([*loads, *[0.0] * others], np.float32) * scale
+    alone = np.array([loads[0], *[0.01] * (len(loads) + others - 1)], np.float32) * scale
+    np.testing.assert_array_equal(carried_by_several(np.array([alike, alone])), [True, False])
+    assert not carried_by_several(np.zeros((1, 4), np.float32)).any()
 
 
 @pytest.mark.parametrize("line", [Line(0, "row", 3), Line(0, "column", 5)])

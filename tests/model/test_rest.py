@@ -94,6 +94,37 @@ def test_cells_that_are_stuck_tell_nothing_of_where_the_others_of_their_pad_rest
     np.testing.assert_allclose(offset[:, 19:], -40, atol=12)
 
 
+def test_what_a_pad_swings_by_is_no_load_of_cells_that_show_more_of_it_than_others():
+    living = np.ones(24, bool)
+    rest = fit_rest(record_of(touched(0), 8), 1000.0, 1.0, PAD, living)
+    swing = 40 * (1 + np.sin(np.arange(48) / 9))
+    resting = []
+    for seed in range(40):
+        share = np.random.default_rng(seed).uniform(0.5, 1.5, 12)
+        log = touched(1)
+        for frames in log:
+            frames[:, 12:] += (share * swing[:, None]).round()
+        above = above_rest(rest, record_of(log, 8), living)
+        resting.append((np.abs(above[:, 12:]) <= 2 * rest.near[12:]).mean())
+    # one share for all cells: in 8 of 40 draws
+    assert (np.array(resting) > 0.95).sum() >= 24
+
+
+@given(reach=st.integers(4, 12), ends=st.integers(0, 4))
+def test_loads_that_reach_the_top_saturate_though_some_cells_end_there(reach, ends):
+    living = np.ones(24, bool)
+    rest = fit_rest(record_of(touched(0), 8), 1000.0, 1.0, PAD, living)
+    log = touched(1)
+    record = record_of(log, 8)
+    assert not rest.saturates(record, above_rest(rest, record, living), living)
+    for frames in log:
+        loads = 100 + 5 * (frames[:, :reach] - 100)
+        frames[:, :reach] = np.clip(loads, 0, 1000)
+    log[-1][36:, :ends] = 1000.0
+    record = record_of(log, 8)
+    assert rest.saturates(record, above_rest(rest, record, living), living)
+
+
 @given(st.sets(st.integers(12, 23), max_size=4))
 def test_a_cell_that_does_not_drift_with_its_pad_is_learned_as_such(steady):
     rng = np.random.default_rng(7)

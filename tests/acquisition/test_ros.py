@@ -14,6 +14,8 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
+from adaptfault.acquisition.followed import BundleAt, Follower, Sensor
+from adaptfault.acquisition.watch import WAITING, Watch
 from adaptfault.data.calibration import Calibration
 from adaptfault.data.recordings.formats.message_arrays import arrays_at, join, put
 from adaptfault.imputation.restorer import Restorer
@@ -21,8 +23,7 @@ from adaptfault.robot.ros_diagnostics import Level, diagnostic_array, stale_arra
 from adaptfault.ros2 import parameters
 from adaptfault.ros2.parameters import DEFAULTS, Parameters, quoted, unknown
 from adaptfault.ros2.rounds import Part, Rounds
-from adaptfault.ros2.sensor import Follower, Sensor
-from adaptfault.ros2.watch import WAITING, Watch
+from adaptfault.ros2.sensor import sensor_of
 from diagnostics import (
     Fault,
     FaultKind,
@@ -176,13 +177,11 @@ PACKAGE = Path(__file__).parents[2] / "examples" / "ros2"
 
 def test_the_node_takes_its_array_from_its_parameters(tmp_path):
     given = Parameters(layout="2x6x5", full_scale=3.3, unit="V", rate=50.0)
-    assert Sensor.from_parameters(given).layout == SensorLayout(
-        2, 6, 5, full_scale=3.3, unit="V", rate=50
-    )
+    assert sensor_of(given).layout == SensorLayout(2, 6, 5, full_scale=3.3, unit="V", rate=50)
     (tmp_path / "layout.json").write_text(json.dumps(LAYOUT.to_dict()))
-    assert Sensor.from_parameters(Parameters(layout=str(tmp_path / "layout.json"))).layout == LAYOUT
+    assert sensor_of(Parameters(layout=str(tmp_path / "layout.json"))).layout == LAYOUT
     with pytest.raises(ValueError, match="give the parameter bundle, or the parameter layout"):
-        Sensor.from_parameters(Parameters())
+        sensor_of(Parameters())
     with pytest.raises(ValueError, match=f"frames of 7 values come, expected {LAYOUT.n_cells}"):
         watch_of(SelfDiagnosis(LAYOUT)).put(np.zeros(7))
 
@@ -445,20 +444,20 @@ def test_the_node_converts_counts_with_the_calibration_of_the_bundle_and_restore
 
 
 def test_the_node_restores_nothing_without_a_bundle_or_a_frame_of_its_sensor(made_bundle):
-    assert Sensor.from_parameters(Parameters(layout="2x6x5")).restorer is None
-    assert Sensor.from_parameters(Parameters(bundle=str(made_bundle), restored="")).restorer is None
+    assert sensor_of(Parameters(layout="2x6x5")).restorer is None
+    assert sensor_of(Parameters(bundle=str(made_bundle), restored="")).restorer is None
     assert watch_of(SelfDiagnosis(LAYOUT)).restore(np.zeros(220)) is None
-    watch = Watch(Sensor.from_parameters(Parameters(bundle=str(made_bundle))))
+    watch = Watch(sensor_of(Parameters(bundle=str(made_bundle))))
     assert watch.restore(np.zeros(7)) is None
     assert watch.restore(np.full(60, 1e30)).shape == (60,)
     with pytest.raises(ValueError, match="the bundle states unit"):
-        Sensor.from_parameters(Parameters(bundle=str(made_bundle), unit="V"))
+        sensor_of(Parameters(bundle=str(made_bundle), unit="V"))
 
 
 def test_the_node_puts_exchanged_wires_back_as_the_version_that_the_bundle_runs(
     bundle, small_grasps
 ):
-    follower = Follower(Parameters(bundle=str(bundle.path)), clock=lambda: 0.0)
+    follower = Follower(BundleAt(bundle.path).sensor, bundle.path, clock=lambda: 0.0)
     watch = Watch(follower.sensor)
     rows = bundle.layout.grid(np.arange(bundle.layout.n_cells)).copy()
     rows[0, [1, 4]] = rows[0, [4, 1]]
@@ -481,14 +480,14 @@ def test_the_node_puts_exchanged_wires_back_as_the_version_that_the_bundle_runs(
 
 
 def test_a_bundle_that_can_no_longer_be_read_leaves_the_node_as_it_is(bundle, caplog):
-    follower = Follower(Parameters(bundle=str(bundle.path)), clock=lambda: 0.0)
+    follower = Follower(BundleAt(bundle.path).sensor, bundle.path, clock=lambda: 0.0)
     bundle.deploy(1)
     for file in bundle.path.glob("bundle*.json"):
         file.unlink()
     assert follower.poll() is None
     follower._loading.join()
     assert follower.poll() is None
-    assert "the node goes on as before" in caplog.text
+    assert "all goes on as before" in caplog.text
 
 
 def test_values_are_written_into_the_arrays_of_a_message_in_their_type():
@@ -522,5 +521,5 @@ def test_an_image_gives_its_pixels_without_the_padding_of_its_rows(encoding, dty
 
 
 def test_importing_the_package_imports_no_ros():
-    code = "import sys, adaptfault, adaptfault.ros2.watch; assert 'rclpy' not in sys.modules"
+    code = "import sys, adaptfault, adaptfault.ros2.sensor; assert 'rclpy' not in sys.modules"
     subprocess.run([sys.executable, "-c", code], check=True)

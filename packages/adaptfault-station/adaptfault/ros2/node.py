@@ -1,6 +1,7 @@
 """The lifecycle node: configure opens the bundle, activate subscribes. Needs rclpy.
 
-The executor's one thread restores frames, another one monitors them: :mod:`adaptfault.ros2.watch`.
+The executor's one thread restores frames, another one monitors them
+(:mod:`adaptfault.acquisition.watch`).
 """
 
 from __future__ import annotations
@@ -20,12 +21,13 @@ from rclpy.executors import ExternalShutdownException
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 
+from adaptfault.acquisition.followed import Follower
+from adaptfault.acquisition.watch import Watch
 from adaptfault.data.recordings.formats.message_arrays import arrays_at, join, put
 from adaptfault.ros2.messages import choose_field, diagnostics_message, message_type, stamp_of
 from adaptfault.ros2.parameters import DEFAULTS, Parameters, quoted, unknown
 from adaptfault.ros2.rounds import Part, Rounds
-from adaptfault.ros2.sensor import Follower
-from adaptfault.ros2.watch import Watch
+from adaptfault.ros2.sensor import sensor_of
 
 NAME = "tactile_diagnostics"
 
@@ -80,7 +82,7 @@ class TactileDiagnostics(LifecycleNode):  # type: ignore[misc]
             raise ValueError(f"parameter topic {given.topic!r}: name each topic once")
         self._type = message_type(given.topic_type)
         self._field = choose_field(self._type, given.field)
-        self._follower = Follower(given)
+        self._follower = Follower(partial(sensor_of, given), given.bundle or None)
         sensor = self._follower.sensor
         self.watch = Watch(sensor, name=given.name, hardware_id=given.hardware_id)
         self._diagnostics = self.create_lifecycle_publisher(DiagnosticArray, "/diagnostics", 1)

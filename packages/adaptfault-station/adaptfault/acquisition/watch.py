@@ -1,4 +1,4 @@
-"""The work of the node: restores frames, monitors them, and states their diagnosis. Needs no ROS.
+"""Restores the frames of a running sensor, monitors them, and states their diagnosis.
 
 The thread that receives frames calls all methods but :meth:`Watch.work`, which belongs to a thread
 of its own: to monitor a frame of a large array may take longer than the time between two frames,
@@ -17,10 +17,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptfault.acquisition import FrameRepair
+from adaptfault.acquisition.followed import Sensor
+from adaptfault.acquisition.relay import FrameRepair
 from adaptfault.inspection.converter_range import within_range
 from adaptfault.robot.ros_diagnostics import Level, diagnostic_array, stale_array
-from adaptfault.ros2.sensor import Sensor
 from diagnostics import Fault, FaultSet, Monitor
 
 GRACE = 5.0  # seconds after the start in which no frame is a WARN, and STALE afterwards
@@ -99,11 +99,16 @@ class Watch:
         """
         if self.repair is None or received.size != self.layout.n_cells:
             return None
-        readings = within_range(_readings(received, self.sensor), self.layout)[0]
-        whole, _, _ = self.repair.in_place(
-            received, readings, self.sensor.version, self.sensor.calibration
-        )
+        whole, _, _ = self.restored(self.repair, received)
         return whole
+
+    def restored(
+        self, repair: FrameRepair, received: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_]]:
+        """Return the whole frame ``[D]``, and which cells are restored, as
+        :meth:`FrameRepair.in_place`."""
+        readings = within_range(_readings(received, self.sensor), self.layout)[0]
+        return repair.in_place(received, readings, self.sensor.version, self.sensor.calibration)
 
     def put(self, received: NDArray[np.float64], time: float | None = None) -> None:
         """Take in one frame ``[D]``, to be monitored later: that takes longer than to restore it.

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adaptfault.acquisition.followed import Sensor
-from adaptfault.acquisition.relay import FrameRepair
+from adaptfault.acquisition.relay import FrameRepair, in_place
 from adaptfault.inspection.converter_range import within_range
 from adaptfault.robot.ros_diagnostics import Level, diagnostic_array, stale_array
 from diagnostics import Fault, FaultSet, Monitor
@@ -91,6 +91,15 @@ class Watch:
         if repair is not None:
             repair.found(found)
 
+    def remember(self, faulty: FaultSet) -> None:
+        """Take cells for faulty that an earlier watch of this sensor found, for as long as frames
+        read as they do now: this monitor never saw them work."""
+        with self._changing:
+            self.faulty |= faulty.mask
+            found = self._found()
+        if self.repair is not None:
+            self.repair.found(found)
+
     def restore(self, received: NDArray[np.float64]) -> NDArray[np.float64] | None:
         """Return the whole frame in the unit in which it came; None where nothing restores it.
 
@@ -103,12 +112,13 @@ class Watch:
         return whole
 
     def restored(
-        self, repair: FrameRepair, received: NDArray[np.float64]
+        self, repair: Callable[..., Any], received: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_]]:
-        """Return the whole frame ``[D]``, and which cells are restored, as
-        :meth:`FrameRepair.in_place`."""
+        """Return the whole frame ``[D]``, which cells are restored, and which values are others
+        than those received, as :func:`~adaptfault.acquisition.relay.in_place`."""
         readings = within_range(_readings(received, self.sensor), self.layout)[0]
-        return repair.in_place(received, readings, self.sensor.version, self.sensor.calibration)
+        sensor = self.sensor
+        return in_place(repair, received, readings, sensor.version, sensor.calibration)
 
     def put(self, received: NDArray[np.float64], time: float | None = None) -> None:
         """Take in one frame ``[D]``, to be monitored later: that takes longer than to restore it.

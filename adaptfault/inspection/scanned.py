@@ -18,7 +18,7 @@ def inspection_with_scan(inspection: Inspection, scan: Scan) -> tuple[Inspection
     """
     rewiring = inspection.rewiring
     if rewiring is not None and scan.readings.shape[1] == inspection.diagnosis.layout.n_cells:
-        scan = Scan(scan.levels, rewiring.undo(scan.readings))
+        scan = replace(scan, readings=rewiring.undo(scan.readings))
     found = judge_scan(scan, inspection.diagnosis.layout)
     diagnosis = with_scan(inspection.diagnosis, found)
     others = [one for one in inspection.findings if one.name not in OF_CELLS]

@@ -102,7 +102,8 @@ class Touch:
                     " expected a mask with one value a reading"
                 )
             masks[name] = mask
-        return self._frames(masks, 1.0) != 0
+        valid: NDArray[np.bool_] = self._frames(masks, 1.0) != 0
+        return valid
 
     def parts(self, values: NDArray[Any]) -> dict[str, Tensor]:
         """Return values ``[n_frames, D]`` as the features lie, on their devices."""

@@ -79,6 +79,7 @@ def _maintain(args: Maintain) -> int:
         budget=args.budget,
         untested_code=args.untested_code,
         routine=routine,
+        scan=incoming.scan,
         sign=args.sign,
         say=args.say,
     )

@@ -115,6 +115,8 @@ def saved_and_read(folder: Path, bundle: af.Bundle, frames: np.ndarray) -> None:
     again = PolicyProcessorPipeline.from_pretrained(folder / "policy", FILE)
     one = observation(frames[0])
     given = before(one)
+    assert given[STATE].shape == (1, 4)  # LeRobot's own step adds a batch dimension here,
+    assert given[SIDES[0]].shape == (6, 5)  # and none to touch
     for name, value in again(one).items():
         if isinstance(value, torch.Tensor):
             assert torch.equal(value, given[name]), name

@@ -102,6 +102,23 @@ def test_where_lines_float_no_open_crossing_is_alive(seed, cell, leak, spread, l
     assert found.faults or "stay untested" in str(found)
 
 
+@given(
+    st.integers(0, 10**6),
+    st.sets(cells, max_size=4),
+    st.sampled_from([None, 0, 2]),
+    st.sampled_from([1e12, 1e8, 2e7]),
+    CONDUCTION,
+)
+def test_where_lines_float_none_of_several_is_alive(seed, opens, before, leak, spread):
+    faults = [StuckCell(cell, np.inf) for cell in opens]
+    if before is not None:
+        faults.append(CutLine(Line(0, "row", 3), before))
+        opens = opens | set(LAYOUT.cells_on(Line(0, "row", 3))[before:].tolist())
+    circuit = Circuit(LAYOUT, "floating", tuple(faults), leak_ohms=leak)
+    found = judge_scan(scan_circuit(circuit, idle_of(spread, seed), seed=seed), LAYOUT)
+    assert not found.alive[list(opens)].any()
+
+
 @given(st.integers(0, 10**6), loads)
 def test_crossings_that_conduct_differently_show_that_lines_are_held(seed, load):
     layout = SensorLayout(1, 16, 16)

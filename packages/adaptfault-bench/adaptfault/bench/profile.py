@@ -70,7 +70,7 @@ class SensorProfile:
     step: float = 0.0
 
     def __post_init__(self) -> None:
-        sizes = dict.fromkeys(_OF_CELLS, (self.layout.n_cells,))
+        sizes: dict[str, tuple[int, ...]] = dict.fromkeys(_OF_CELLS, (self.layout.n_cells,))
         sizes["crosstalk"] = (2, self.layout.pads)
         for name, size in sizes.items():
             values = np.asarray(getattr(self, name), np.float64)
@@ -200,12 +200,10 @@ class SensorProfile:
         """
         check_schema(d, SCHEMA)
         try:
-            return cls(
-                SensorLayout.from_dict(d["layout"]),
-                tuple(Fault.from_dict(one) for one in d["faults"]),
-                *(np.asarray(d[name], np.float64) for name in (*_OF_CELLS, "crosstalk")),
-                step=float(d["step"]),
-            )
+            faults = tuple(Fault.from_dict(one) for one in d["faults"])
+            layout = SensorLayout.from_dict(d["layout"])
+            numbers = {name: np.asarray(d[name], float) for name in (*_OF_CELLS, "crosstalk")}
+            return cls(layout, faults, step=float(d["step"]), **numbers)
         except KeyError as error:
             raise ValueError(f"the profile is damaged: {error} is missing") from None
         except TypeError as error:

@@ -36,7 +36,7 @@ class BundleAt:
         restores: whether frames will be restored.
     """
 
-    path: str | os.PathLike[str]
+    path: str | Path
     keys: Sequence[str | os.PathLike[str]] | None = None
     restores: bool = True
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import threading
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +12,7 @@ from adaptfault.acquisition.followed import BundleAt, Follower
 from adaptfault.acquisition.relay import FrameRepair
 from adaptfault.acquisition.watch import Watch
 from adaptfault.lerobot.limits import Limits, NotCertified
-from diagnostics import FaultSet, SensorLayout
+from diagnostics import Fault, FaultSet, SensorLayout
 
 _log = logging.getLogger(__name__)
 
@@ -21,6 +22,8 @@ Mask = NDArray[np.bool_]
 
 class LiveTouch:
     """Restores and monitors the frames of one sensor, and follows its bundle.
+
+    A thread of its own monitors them: no frame waits for an evaluation.
 
     Args:
         bundle: of the sensor.
@@ -40,6 +43,7 @@ class LiveTouch:
         self._follower = Follower(bundle.sensor, bundle.path)
         self._watch = Watch(self._follower.sensor)
         self._watches = watch
+        self._monitoring: threading.Thread | None = None
         self._limits = limits or Limits()
         self.layout: SensorLayout = self._watch.layout
         self._decide()
@@ -79,10 +83,9 @@ class LiveTouch:
         frames = np.where(given, received, np.nan)
         repair = self._repair
         if len(frames) == 1 and self._watches:
-            self._watch.put(frames[0])
-            for fault in self._watch.work():
-                _log.warning("%s", fault.reason)
-                self._decide()
+            self._monitor(frames[0])
+        if self.fault_set != self._judged:
+            self._decide()
         if self._refusal is not None:
             raise NotCertified(f"the policy must not act: {self._refusal}")
         fill = repair if len(frames) == 1 else repair.alone
@@ -95,6 +98,15 @@ class LiveTouch:
         assert self._watch.repair is not None  # the bundle brings a restorer
         return self._watch.repair
 
+    def _monitor(self, frame: Frames) -> None:
+        """Leave a frame to the thread that monitors."""
+        if self._monitoring is None:
+            self._monitoring = threading.Thread(
+                target=self._watch.work_on, args=[_tell], name="adaptfault-monitor", daemon=True
+            )
+            self._monitoring.start()
+        self._watch.put(frame)
+
     def _keep_up(self) -> None:
         """Go on with what a maintenance run wrote, once it is loaded."""
         sensor = self._follower.poll()
@@ -106,4 +118,9 @@ class LiveTouch:
 
     def _decide(self) -> None:
         """Ask whether the policy may act with the cells that are faulty now."""
-        self._refusal = self._limits.refusal(self._watch.sensor, self.fault_set)
+        self._judged = self.fault_set
+        self._refusal = self._limits.refusal(self._watch.sensor, self._judged)
+
+
+def _tell(fault: Fault) -> None:
+    _log.warning("%s", fault.reason)

@@ -70,8 +70,7 @@ def maintain(
             the cells.
         routine: of which the recordings are a log: the report says what it left untested, and the
             next best recording.
-        scan: of the read-out that tests itself, in the time of the recordings: evidence like any
-            other, but that known faulty cells do not recover by it. None: there is none.
+        scan: of the read-out, in their time; known faulty cells do not recover by it. None: none.
         sign: PEM file of the private key that signs the bundle with what the run deploys; None: it
             is not signed.
         say: receives one line of progress before each long step.
@@ -81,12 +80,7 @@ def maintain(
         Damaged: a needed part of the bundle fails its checksum.
         ValueError: the routine or the scan is for another number of cells.
     """
-    if routine is not None:
-        routine.check(bundle.layout)
-    if scan is not None:
-        judge_scan(scan, bundle.layout)
-    if sign is not None:
-        read_private_key(sign)  # before the work that it would be missing for
+    _check(bundle, routine, scan, sign)
     began = time.perf_counter()
     with bundle.maintenance(dry_run=dry_run):
         if not dry_run:
@@ -110,6 +104,22 @@ def maintain(
         if sign is not None and not dry_run and report.decision != "deployed":
             sign_bundle(bundle, sign)
     return replace(report, seconds=time.perf_counter() - began)
+
+
+def _check(
+    bundle: Bundle,
+    routine: Routine | None,
+    scan: Scan | None,
+    sign: str | PathLike[str] | None,
+) -> None:
+    """Refuse what fits no run before the work that it would be missing for; the errors are those of
+    :func:`maintain`."""
+    if routine is not None:
+        routine.check(bundle.layout)
+    if scan is not None:
+        judge_scan(scan, bundle.layout)
+    if sign is not None:
+        read_private_key(sign)
 
 
 def _fresh(incoming: Sequence[IncomingRecording], bundle: Bundle) -> list[IncomingRecording]:

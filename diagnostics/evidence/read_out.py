@@ -62,8 +62,8 @@ _RESIDUE = 0.02  # of the usual response: a residue of a line, not of the conver
 _LOADED = 10.0  # times the usual response: as under load
 _MAY_FLOAT = (
     "nothing shows that the lines which are not selected are held, and where they float an open"
-    " crossing answers, too: those that answer stay untested; if they are held, state"
-    " Scan(..., holds_lines=True)"
+    " crossing answers, too: those that answer stay untested; if they are held, state --lines-held,"
+    " or Scan(..., holds_lines=True)"
 )
 
 Floats = NDArray[np.float64]

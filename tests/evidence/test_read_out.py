@@ -133,7 +133,7 @@ def test_where_crossings_conduct_alike_the_scan_has_to_state_that_lines_are_held
     unknown = judge_scan(scan, LAYOUT)
     assert not unknown.alive.any()
     assert not unknown.faults
-    assert "state Scan(..., holds_lines=True)" in unknown.incomplete
+    assert "state --lines-held, or Scan(..., holds_lines=True)" in unknown.incomplete
     assert judge_scan(held(scan), LAYOUT).alive.all()
     assert not judge_scan(replace(scan, holds_lines=False), LAYOUT).alive.any()
     broken = Circuit(LAYOUT, faults=(StuckCell(9, np.inf),))

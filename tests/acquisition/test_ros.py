@@ -35,6 +35,8 @@ from diagnostics import (
     line_fault,
     lose_frames,
 )
+from diagnostics.simulation.circuit import Circuit, StuckCell
+from diagnostics.simulation.scan import scan_circuit
 
 LAYOUT = SensorLayout.paper()
 
@@ -477,6 +479,30 @@ def test_the_node_puts_exchanged_wires_back_as_the_version_that_the_bundle_runs(
     assert np.flatnonzero(watch.faulty).tolist() == list(row.cells)
     others = np.flatnonzero(~watch.faulty)
     np.testing.assert_array_equal(watch.restore(frames[5][wired])[others], frames[5][others])
+
+
+def test_a_scan_of_the_read_out_is_evidence_of_the_node(small_grasps):
+    layout = small_grasps.layout
+    now = [1000.0]
+    restorer = Restorer(layout).fit(small_grasps.frames[::7])
+    watch = watch_of(SelfDiagnosis(layout), clock=lambda: now[0], restorer=restorer)
+    frame = np.zeros(layout.n_cells)
+    for _ in range(100):
+        take(watch, frame)
+    idle = np.full(layout.n_cells, 0.01)
+    scan = scan_circuit(Circuit(layout, faults=(StuckCell(33, np.inf),)), idle, repeats=5)
+    for level, values in zip(scan.levels, scan.readings, strict=True):
+        watch.scan(level, values)
+    watch.diagnostics(5.0)
+    assert watch.read_out is None  # it may go on
+    now[0] += 2.1
+    take(watch, frame)
+    told = levels(watch.diagnostics(5.0))
+    assert [fault.cells for fault in watch.read_out.faults] == [(33,)]
+    assert Level.WARN in told.values()
+    assert watch.repair.fault_set == FaultSet((33,), layout.n_cells)
+    with pytest.raises(ValueError, match="a frame of a scan has level 2 and 7 values, expected 0"):
+        watch.scan(2.0, np.zeros(7))
 
 
 def test_a_bundle_that_can_no_longer_be_read_leaves_the_node_as_it_is(bundle, caplog):

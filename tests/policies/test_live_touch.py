@@ -2,6 +2,7 @@
 refused."""
 
 import importlib.metadata
+import time
 
 import numpy as np
 import pytest
@@ -73,6 +74,21 @@ def test_a_version_that_is_deployed_takes_over_between_two_frames(bundle, live, 
 def test_cells_that_an_earlier_run_found_are_filled_too(live, small_grasps):
     live.remember(FaultSet((3,), 60))
     _, valid, _ = whole(live, small_grasps.frames[0][20])
+    assert np.flatnonzero(~valid[0]).tolist() == [3, *DEAD]
+
+
+def test_what_the_monitor_finds_is_filled_from_then_on(live, small_grasps, monkeypatch):
+    frame = small_grasps.frames[0][20]
+    found = Fault(FaultKind.STUCK, (3,), value=1.0, probability=1.0)
+    monkeypatch.setattr(live._watch.monitor, "update", lambda frame, time: (found,))
+    whole(live, np.stack([frame, frame]))
+    assert live._monitoring is None  # a batch is not monitored
+    _, valid, _ = whole(live, frame)
+    assert valid[0, 3]
+    while 3 not in live.fault_set:
+        assert live._monitoring.is_alive()
+        time.sleep(0.01)
+    _, valid, _ = whole(live, frame)
     assert np.flatnonzero(~valid[0]).tolist() == [3, *DEAD]
 
 

@@ -57,7 +57,12 @@ class Scans:
         if self._began is not None:
             self.time += max(frame.time - self._began, 0.0)
             self._began = None
-        return self.end() if frame.time - self._latest > ENDS else None
+        return self.ended(frame.time)
+
+    def ended(self, now: float) -> ReadOut | None:
+        """End the scan where its last frame is long past; return what it says, None where there is
+        none, or it goes on."""
+        return self.end() if now - self._latest > ENDS else None
 
     def end(self) -> ReadOut | None:
         """End the scan; return what it says, None where there is none."""

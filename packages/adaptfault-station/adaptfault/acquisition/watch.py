@@ -18,10 +18,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adaptfault.acquisition.followed import Sensor
+from adaptfault.acquisition.ordering import Frame
 from adaptfault.acquisition.relay import FrameRepair, in_place
+from adaptfault.acquisition.scanning import Scans
 from adaptfault.inspection.converter_range import within_range
 from adaptfault.robot.ros_diagnostics import Level, diagnostic_array, stale_array
-from diagnostics import Fault, FaultSet, Monitor
+from diagnostics import Fault, FaultSet, Monitor, ReadOut, with_scan
 
 GRACE = 5.0  # seconds after the start in which no frame is a WARN, and STALE afterwards
 SILENCE = 2.0  # seconds without a frame, after which everything is STALE; at least so many periods:
@@ -38,6 +40,7 @@ class Watch:
     Args:
         sensor: as the bundle or the layout states it.
         name, hardware_id: of :func:`~adaptfault.robot.ros_diagnostics.diagnostic_array`.
+        lines_held: of the scans of the read-out, as in :class:`diagnostics.Scan`.
         clock: seconds, never set back.
     """
 
@@ -47,6 +50,7 @@ class Watch:
         *,
         name: str = "tactile",
         hardware_id: str = "tactile",
+        lines_held: bool | None = None,
         clock: Callable[[], float] = monotonic,
     ) -> None:
         self.name = name
@@ -56,6 +60,8 @@ class Watch:
         self.layout = sensor.layout
         self.faulty = np.zeros(self.layout.n_cells, bool)  # as the monitor finds
         self.monitor = Monitor(sensor.diagnoser)
+        self.read_out: ReadOut | None = None  # what the last scan says
+        self._scans = Scans(self.layout, lines_held)
         self._changing = threading.Lock()  # held for moments, never while a frame is monitored
         self._comes = threading.Event()  # set where frames wait, or the work ends
         self.repair = self._repair_of(sensor)
@@ -84,6 +90,7 @@ class Watch:
         with self._changing:
             if other:
                 self.faulty[:] = False
+                self.read_out = None
             self.sensor = sensor
             self.monitor = monitor
             self.repair = repair
@@ -143,6 +150,35 @@ class Watch:
                 self.left_out += 1
         self._comes.set()
 
+    def scan(self, level: float, values: NDArray[np.float64]) -> None:
+        """Take in one frame ``[D]`` of a scan of the read-out; the scan ends two seconds after its
+        last frame.
+
+        Args:
+            level: share of the drive, 0 to 1.
+            values: shares of the converter's range, 0 to 1, each where its cell answers.
+
+        Raises:
+            ValueError: another number of values than cells, or another level.
+        """
+        if values.size != self.layout.n_cells or not 0 <= level <= 1:
+            raise ValueError(
+                f"a frame of a scan has level {level:g} and {values.size} values, expected 0 to 1"
+                f" and {self.layout.n_cells}"
+            )
+        self.last = self.clock()
+        version = self.sensor.version
+        placed = values if version is None else values[version.source]
+        self._scans.add(Frame(self.name, self.last, placed, scan=float(level)))
+
+    def _end_scan(self, now: float) -> None:
+        """Take a scan that has ended for evidence: its broken cells are restored, too."""
+        found = self._scans.ended(now)
+        if found is not None:
+            self.read_out = found
+            cells = tuple(np.flatnonzero(found.broken).tolist())
+            self.remember(FaultSet(cells, found.broken.size))
+
     @property
     def waiting(self) -> bool:
         """Whether frames wait to be monitored."""
@@ -199,6 +235,7 @@ class Watch:
             stamp: seconds since 1970.
         """
         now = self.clock()
+        self._end_scan(now)
         about: dict[str, Any] = {"stamp": stamp, "name": self.name, "hardware_id": self.hardware_id}
         if self.last is None:
             waited = now - self.started
@@ -212,6 +249,8 @@ class Watch:
         if evaluated is None:
             what = "the first frames are being evaluated"
             return stale_array(self.layout, what, level=Level.WARN, **about)
+        if self.read_out is not None:
+            evaluated = with_scan(evaluated, self.read_out)
         return diagnostic_array(evaluated, rate=self._rate(now), **about)
 
     def _rate(self, now: float) -> float | None:

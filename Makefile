@@ -71,8 +71,10 @@ wheel-check: .venv/installed-dev
 # LeRobot brings gigabytes, and another torch: an environment of its own.
 lerobot-check:
 	test -e build/lerobot/bin/python || $(PYTHON) -m venv build/lerobot
-	build/lerobot/bin/python -m pip install --quiet --disable-pip-version-check '.[datasets]' lerobot==0.4.4
+	build/lerobot/bin/python -m pip install --quiet --disable-pip-version-check '.[datasets]' \
+		./packages/adaptfault-station './packages/lerobot_policy_adaptfault[lerobot]'
 	build/lerobot/bin/python tests/check_lerobot.py
+	build/lerobot/bin/python tests/check_touch_step.py
 
 # A store in the manner of S3 and a Hub that run here, and ones that do not answer: an environment of its own.
 remote-check:
@@ -112,7 +114,7 @@ format: .venv/installed-dev
 
 install-dev:
 	$(INSTALL) $(CONSTRAINTS) -e '.[dev]' -e './packages/adaptfault-bench[mujoco]' -e ./packages/adaptfault-firmware -e ./packages/adaptfault-paper \
-		-e ./packages/adaptfault-prognosis -e './packages/adaptfault-station[ros2]'
+		-e ./packages/adaptfault-prognosis -e './packages/adaptfault-station[ros2]' -e ./packages/lerobot_policy_adaptfault
 
 .venv/installed-docs: .venv/installed
 	$(INSTALL) $(CONSTRAINTS) -e '.[docs]'

@@ -41,8 +41,8 @@ html_show_copyright = False
 
 myst_heading_anchors = 3
 
-# The node is described where no ROS 2 is installed, too.
-autodoc_mock_imports = ["diagnostic_msgs", "rcl_interfaces", "rclpy"]
+# The node and the step are described where neither ROS 2 nor LeRobot is installed, too.
+autodoc_mock_imports = ["diagnostic_msgs", "lerobot", "rcl_interfaces", "rclpy"]
 autodoc_default_options = {"members": True, "member-order": "bysource"}
 # Show the names of these aliases, not the types behind them, which fill half a page.
 autodoc_type_aliases = {

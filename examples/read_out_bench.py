@@ -3,6 +3,8 @@ on the circuit of an array.
 
     python examples/read_out_bench.py [--arrays 200] [--small]
 
+The last rows are of a read-out that lets all lines float which it does not select.
+
 Each array has two open crossings, a shorted one of up to 1 kiloohm, and every second one a row or
 column that is cut somewhere. Preload, leakage to ground (1 megaohm to 1 gigaohm) and the noise of
 the converter (12 bits) differ from array to array.
@@ -20,6 +22,7 @@ from diagnostics.simulation.scan import scan_circuit
 
 SIZES = ((16, 16), (11, 10))
 READ_OUTS = {"grounded": 100.0, "virtual ground": 1.0}  # ohms of the divider
+LEAKS = {"1 megaohm to 1 gigaohm": (6, 9), "0.1 to 1 megaohm": (5, 6)}  # where lines float
 PRELOAD = 0.02  # newton at most, of 5
 
 
@@ -89,6 +92,23 @@ def lines(layout: SensorLayout, load: float, arrays: int) -> list[str]:
     return told
 
 
+def floating(layout: SensorLayout, leaks: tuple[float, float], arrays: int) -> Counter:
+    """Return counts of open crossings where the read-out lets all lines float that it does not
+    select; ``leaks``: logarithms of the least and the highest leakage in ohms."""
+    rng = np.random.default_rng(2)
+    count: Counter = Counter()
+    for i in range(arrays):
+        faults, is_open, is_short = broken(layout, rng, cut=i % 2 == 0)
+        leak = 10 ** rng.uniform(*leaks)
+        found = scanned(Circuit(layout, "floating", faults, leak_ohms=leak), rng)
+        told = np.isin(np.arange(layout.n_cells), [c for f in found.faults for c in f.cells])
+        count["open"] += int(is_open.sum())
+        count["alive"] += int((found.alive & is_open).sum())
+        count["found"] += int((told & is_open).sum())
+        count["blamed"] += int((told & ~is_open & ~is_short).sum())
+    return count
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--arrays", type=int, default=200)
@@ -107,6 +127,13 @@ def main() -> None:
             )
             for text in lines(layout, load, max(arrays // 10, 4)):
                 print(f"    line {text}")
+        for name, leaks in LEAKS.items():
+            count = floating(layout, leaks, arrays)
+            print(
+                f"{rows} x {cols}, lines float, leakage {name}, {arrays} arrays: of"
+                f" {count['open']} open {count['alive']} called ALIVE, {count['found']} found;"
+                f" healthy blamed {count['blamed']}"
+            )
 
 
 if __name__ == "__main__":

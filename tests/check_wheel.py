@@ -37,7 +37,7 @@ else:
     raise AssertionError("the core brings a station")
 """
 BESIDE = """
-import sys, adaptfault, adaptfault.bench, adaptfault.firmware, adaptfault.paper
+import sys, adaptfault, adaptfault.bench, adaptfault.firmware, adaptfault.lerobot, adaptfault.paper
 import adaptfault.prognosis, adaptfault.ros2
 import diagnostics.simulation.circuit as circuit
 for package in (adaptfault.bench, circuit, sys.modules[adaptfault.Station.__module__]):

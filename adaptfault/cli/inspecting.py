@@ -12,6 +12,7 @@ from adaptfault.cli.reading import Reading
 from adaptfault.cli.shared_options import (
     Trusting,
     cache_option,
+    lines_held_option,
     reference_option,
 )
 
@@ -56,6 +57,7 @@ class Inspecting(Trusting, Reading):
 
     reference: list[Read] | None = reference_option()
     no_cache: bool = cache_option()
+    lines_held: bool = lines_held_option()
 
 
 class Paged(Protocol):
@@ -90,7 +92,8 @@ def inspect_log(
     if log.scan is not None:
         from adaptfault.inspection.scanned import inspection_with_scan
 
-        inspection, found = inspection_with_scan(inspection, log.scan)
+        scan = replace(log.scan, holds_lines=args.lines_held or None)
+        inspection, found = inspection_with_scan(inspection, scan)
         args.say(f"scan: {found.summary}")
     return InspectedLog(log, inspection, bundle)
 

@@ -4,6 +4,7 @@ it."""
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from adaptfault.cli.command import argument, option
@@ -12,6 +13,7 @@ from adaptfault.cli.shared_options import (
     Signing,
     bundle_argument,
     count_from_option,
+    lines_held_option,
     metrics_option,
     untested_code_option,
 )
@@ -45,6 +47,7 @@ class Maintain(Signing):
     untested_code: int = untested_code_option()
     report: Written | None = option("write the technician's report (HTML)", "FILE")
     count_from: int = count_from_option()
+    lines_held: bool = lines_held_option()
     metrics: Written | None = metrics_option()
 
     def run(self) -> int:
@@ -71,6 +74,9 @@ def _maintain(args: Maintain) -> int:
     bundle = args.opened(args.bundle)
     incoming = load_new_recordings(bundle, args.recordings)
     args.tell_problems(incoming.problems)
+    scan = incoming.scan
+    if scan is not None:
+        scan = replace(scan, holds_lines=args.lines_held or None)
     report = maintain(
         bundle,
         incoming.frames,
@@ -79,6 +85,7 @@ def _maintain(args: Maintain) -> int:
         budget=args.budget,
         untested_code=args.untested_code,
         routine=routine,
+        scan=scan,
         sign=args.sign,
         say=args.say,
     )

@@ -110,6 +110,14 @@ def count_from_option() -> Any:
     )
 
 
+def lines_held_option() -> Any:
+    """Return whether a scan holds lines (:class:`diagnostics.Scan`)."""
+    return option(
+        "the read-out holds the lines that it does not select: crossings that answer a scan are"
+        " alive, however alike they conduct"
+    )
+
+
 def metrics_option() -> Any:
     """Return the file of metrics."""
     return option(

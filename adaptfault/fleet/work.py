@@ -73,7 +73,7 @@ def _maintained(
 
     bundle = Bundle.open(robot.bundle, **whose)
     incoming = load_new_recordings(bundle, robot.paths())
-    report = maintain(bundle, incoming.frames, names=incoming.names, **how)
+    report = maintain(bundle, incoming.frames, names=incoming.names, scan=incoming.scan, **how)
     notes = tuple(problem.message for problem in incoming.problems if problem.level == "error")
     return Outcome.of(robot, bundle, report, notes=notes, seconds=time.perf_counter() - began)
 

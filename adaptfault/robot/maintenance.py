@@ -24,6 +24,7 @@ from adaptfault.inspection.find_changes import as_loads, find_sensor_change
 from adaptfault.inspection.incoming import IncomingRecording, incoming_recordings
 from adaptfault.inspection.inspection import inspect
 from adaptfault.inspection.result import Inspection
+from adaptfault.inspection.scanned import inspection_with_scan
 from adaptfault.inspection.severity import (
     UNKNOWN,
     Reason,
@@ -35,6 +36,7 @@ from adaptfault.robot.maintenance_report import MaintenanceReport
 from adaptfault.robot.maintenance_run import MaintenanceRun, Robot
 from adaptfault.robot.model_comparison import score, with_faults
 from adaptfault.robot.routine import Routine
+from diagnostics import Scan, judge_scan
 from diagnostics.sensor.ageing import cell_condition
 from diagnostics.sensor.sensor_change import SensorChange
 
@@ -51,6 +53,7 @@ def maintain(
     budget: float | None = None,
     untested_code: int = 1,
     routine: Routine | None = None,
+    scan: Scan | None = None,
     sign: str | PathLike[str] | None = None,
     say: Callable[[str], None] = lambda text: None,
 ) -> MaintenanceReport:
@@ -67,6 +70,7 @@ def maintain(
             the cells.
         routine: of which the recordings are a log: the report says what it left untested, and the
             next best recording.
+        scan: of the read-out, in their time; known faulty cells do not recover by it. None: none.
         sign: PEM file of the private key that signs the bundle with what the run deploys; None: it
             is not signed.
         say: receives one line of progress before each long step.
@@ -74,12 +78,9 @@ def maintain(
     Raises:
         Busy: another maintenance run holds the lock.
         Damaged: a needed part of the bundle fails its checksum.
-        ValueError: the routine is for another number of cells.
+        ValueError: the routine or the scan is for another number of cells.
     """
-    if routine is not None:
-        routine.check(bundle.layout)
-    if sign is not None:
-        read_private_key(sign)  # before the work that it would be missing for
+    _check(bundle, routine, scan, sign)
     began = time.perf_counter()
     with bundle.maintenance(dry_run=dry_run):
         if not dry_run:
@@ -96,12 +97,29 @@ def maintain(
             say=say,
             warnings=warnings,
             left_out=tuple(text for one in fresh if (text := one.left_out(bundle.layout))),
+            scan=scan,
         )
         usable = [recording for recording in fresh if recording.problem is None]
         report = _maintained(run, usable, untested_code, routine) if usable else _idle(run, fresh)
         if sign is not None and not dry_run and report.decision != "deployed":
             sign_bundle(bundle, sign)
     return replace(report, seconds=time.perf_counter() - began)
+
+
+def _check(
+    bundle: Bundle,
+    routine: Routine | None,
+    scan: Scan | None,
+    sign: str | PathLike[str] | None,
+) -> None:
+    """Refuse what fits no run before the work that it would be missing for; the errors are those of
+    :func:`maintain`."""
+    if routine is not None:
+        routine.check(bundle.layout)
+    if scan is not None:
+        judge_scan(scan, bundle.layout)
+    if sign is not None:
+        read_private_key(sign)
 
 
 def _fresh(incoming: Sequence[IncomingRecording], bundle: Bundle) -> list[IncomingRecording]:
@@ -120,8 +138,10 @@ def _idle(run: MaintenanceRun, fresh: Sequence[IncomingRecording]) -> Maintenanc
         return _report(
             run, Outcome("refused", (Reason(UNKNOWN, "no recording is usable"),), run.known)
         )
-    reason = Reason(severity_of(run, run.known.fault_set), "all recordings were used before")
-    outcome = _with_onnx(run, Outcome("unchanged", (reason,), run.known))
+    reasons = [Reason(severity_of(run, run.known.fault_set), "all recordings were used before")]
+    if run.scan is not None:
+        reasons.append(Reason(1, "scan: not used, as it came without a new recording"))
+    outcome = _with_onnx(run, Outcome("unchanged", tuple(reasons), run.known))
     report = _report(run, outcome)
     if outcome.deploys is not None:
         _write(run, outcome, report, ())
@@ -140,7 +160,9 @@ def _maintained(
         run.version.undo(recording.frames) for recording in usable if recording.frames is not None
     ]
     inspection = inspect(frames, run.robot.diagnoser, reference=run.robot.healthy)
+    inspection, told = _scanned(run, inspection)
     outcome = _with_onnx(run, decide(run, inspection))
+    outcome = replace(outcome, reasons=(*outcome.reasons, *told))
     report = _report(run, outcome, inspection, untested_code)
     if outcome.used:
         report = replace(report, used=tuple(recording.name for recording in usable))
@@ -149,6 +171,15 @@ def _maintained(
     if not run.dry_run:
         _write(run, outcome, report, usable)
     return report
+
+
+def _scanned(run: MaintenanceRun, inspection: Inspection) -> tuple[Inspection, tuple[Reason, ...]]:
+    """Return an inspection with the evidence of the scan, and what is told of the scan."""
+    if run.scan is None:
+        return inspection, ()
+    scan = replace(run.scan, readings=run.scan.readings[:, run.version.source])
+    inspection, found = inspection_with_scan(inspection, scan, run.known.fault_set)
+    return inspection, (Reason(1 if found.incomplete else 0, f"scan: {found.summary}"),)
 
 
 def _with_onnx(run: MaintenanceRun, outcome: Outcome) -> Outcome:

@@ -19,7 +19,7 @@ from adaptfault.bundle.versions import Version
 from adaptfault.data.windows import recordings_of
 from adaptfault.evaluation.scores import chance
 from adaptfault.robot.model_comparison import measure_of, score
-from diagnostics import FaultSet, SelfDiagnosis, SensorLayout
+from diagnostics import FaultSet, Scan, SelfDiagnosis, SensorLayout
 
 if TYPE_CHECKING:
     from adaptfault.adaptation.adapter import Adapter
@@ -41,6 +41,7 @@ class MaintenanceRun:
         say: receives one line of progress before each long step.
         warnings: damage found in the bundle.
         left_out: recordings, or readings of them, that are not used, with the reason.
+        scan: of the read-out, in the time of the recordings; None: there is none.
     """
 
     robot: Robot
@@ -52,6 +53,7 @@ class MaintenanceRun:
     say: Callable[[str], None]
     warnings: tuple[str, ...]
     left_out: tuple[str, ...]
+    scan: Scan | None = None
 
 
 class Robot:

@@ -4,7 +4,7 @@ calibration."""
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
 
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from adaptfault.bundle.bundle import Bundle
 from adaptfault.data.recordings.errors import Problem
 from adaptfault.data.recordings.load import load
+from diagnostics import Scan
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,11 +25,13 @@ class NewRecordings:
         frames: ``[T, D]`` each, in the layout's unit.
         names: one a recording.
         problems: recordings that were left out, and warnings.
+        scan: of the read-out, of all recordings together; None: there is none.
     """
 
     frames: tuple[NDArray[np.float32], ...]
     names: tuple[str, ...]
     problems: tuple[Problem, ...]
+    scan: Scan | None = None
 
 
 def load_new_recordings(bundle: Bundle, paths: Sequence[str | PathLike[str]]) -> NewRecordings:
@@ -54,4 +57,13 @@ def load_new_recordings(bundle: Bundle, paths: Sequence[str | PathLike[str]]) ->
         tuple(frames for part in parts for frames in part.recordings.frames),
         tuple(name for part in parts for name in part.recordings.names),
         tuple(problem for part in parts for problem in part.problems),
+        _joined([part.recordings.scan for part in parts if part.recordings.scan is not None]),
     )
+
+
+def _joined(scans: Sequence[Scan]) -> Scan | None:
+    """Return the frames of several scans of one array as one; None: there is none."""
+    if not scans:
+        return None
+    levels = np.concatenate([scan.levels for scan in scans])
+    return replace(scans[0], levels=levels, readings=np.concatenate([s.readings for s in scans]))

@@ -14,10 +14,11 @@ SCHEMAS: Mapping[str, str] = {
     "adaptfault.info/1": "info.json",
     "adaptfault.inspection/1": "inspection.json",
     "adaptfault.layout/1": "layout.json",
+    "adaptfault.profile/1": "profile.json",
 }
 """The file of each schema, in this folder."""
 
-_USED = re.compile(r'"urn:adaptfault:(\w+):(\d+)"')
+_USED = re.compile(r'"urn:adaptfault:(\w+):(\d+)["#]')
 
 
 def schema_of(document: str) -> dict[str, Any]:

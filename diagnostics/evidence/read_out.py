@@ -24,8 +24,9 @@ names lines. Shorted crossings join others in parallel: these tell nothing.
 
 Not detected: what leaves a crossing conducting, as a worn, late or clamped cell, or two lines that
 are joined; a line of which all crossings are shorted or open only under load. A line that is cut
-and one that lies on ground look alike. Where unselected lines float, current through the other
-crossings hides open ones.
+and one that lies on ground look alike. Where lines that are not selected float, current through
+other crossings hides open ones: unless crossings refute that (:func:`holds_lines`), or the scan
+states it, those that answer are neither ALIVE nor open.
 """
 
 from __future__ import annotations
@@ -36,30 +37,34 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.special import expit, log_ndtr, logit, ndtri
+from scipy.special import expit, logit
 
 from diagnostics.decision.line_cover import Cause, solve
 from diagnostics.decision.result import Diagnosis
+from diagnostics.evidence.crossings import (
+    REPEATS,
+    STANDS,
+    TOP,
+    Answer,
+    Healthy,
+    Level,
+    holds_lines,
+    in_parallel,
+    on_faint_lines,
+)
 from diagnostics.faults import Fault, FaultKind
 from diagnostics.layout import SensorLayout
-from diagnostics.preprocessing.levels import CERTAIN_RATIO, EXPECTED, LOW, MAJORITY
-
-TOP = 0.98
-"""Share of the converter's range from which on a reading is saturated."""
-
-REPEATS = 4
-"""Readings of a crossing at a level, at least."""
+from diagnostics.preprocessing.levels import CERTAIN_RATIO, EXPECTED, MAJORITY
 
 _OPEN = 9.2  # evidence of an open crossing: one healthy one in 10,000 is as silent
 _CLEARLY = 4.0  # times the least answer
-_LEAST_SPREAD = 0.5  # standard deviation of log r of healthy crossings
-_STANDS = 5.0  # standard errors that are no noise
-_IN_PROPORTION = 0.25  # ratio - 1
 _RESIDUE = 0.02  # of the usual response: a residue of a line, not of the converter
-_FAINT = 0.03  # of it: a line on ground
-_FEWEST = 3  # crossings of such a line
-_OF_MEDIAN = 1.25  # standard error of a median, in those of a mean
 _LOADED = 10.0  # times the usual response: as under load
+_MAY_FLOAT = (
+    "nothing shows that the lines which are not selected are held, and where they float an open"
+    " crossing answers, too: those that answer stay untested; if they are held, state --lines-held,"
+    " or Scan(..., holds_lines=True)"
+)
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -72,6 +77,8 @@ class Scan:
     Attributes:
         levels: float ``[n]``, share of the drive in each frame, 0 to 1; 0: lines are let go.
         readings: float ``[n, D]``, shares of the converter's range, 0 to 1; NaN: missing.
+        holds_lines: whether the read-out holds the lines that it neither drives nor reads, at
+            ground or as its virtual ground does; None: it is not stated.
 
     Raises:
         ValueError: shapes or numbers that no scan has.
@@ -79,6 +86,7 @@ class Scan:
 
     levels: Floats
     readings: Floats
+    holds_lines: bool | None = None
 
     def __post_init__(self) -> None:
         levels = np.asarray(self.levels, np.float64)
@@ -126,7 +134,7 @@ class ReadOut:
         open, short, held, alive: bool; ``open``: silent ones, certain or not, ``held``: on a line
             at the supply.
         under_load: number of crossings that conduct as under a load.
-        incomplete: what of the scan is missing, one sentence; "": nothing.
+        incomplete: what the scan lacks, one sentence; "": nothing.
     """
 
     layout: SensorLayout
@@ -235,8 +243,8 @@ def judge_scan(scan: Scan, layout: SensorLayout) -> ReadOut:
             incomplete=missing,
         )
     noise = _noise(scan)
-    at = {level: _Level.of(scan, level, noise) for level in (0.0, low, 1.0)}
-    return _judged(at[0.0], at[low], at[1.0], low, layout)
+    at = {level: Level.of(scan.readings[scan.levels == level], noise) for level in (0.0, low, 1.0)}
+    return _judged(at[0.0], at[low], at[1.0], low, layout, scan.holds_lines)
 
 
 def with_scan(diagnosis: Diagnosis, found: ReadOut) -> Diagnosis:
@@ -289,27 +297,6 @@ def scanned(diagnosis: Diagnosis, scan: Scan | None) -> Diagnosis:
     return with_scan(diagnosis, judge_scan(scan, diagnosis.layout))
 
 
-@dataclass(frozen=True)
-class _Level:
-    """Mean and standard error of what each crossing reads at one level, ``[D]``."""
-
-    mean: Floats
-    error: Floats
-
-    @classmethod
-    def of(cls, scan: Scan, level: float, noise: float) -> _Level:
-        readings = scan.readings[scan.levels == level]
-        known = np.isfinite(readings)
-        count = known.sum(axis=0)
-        total = np.where(known, readings, 0.0).sum(axis=0)
-        enough = count >= REPEATS
-        some = np.maximum(count, 1)
-        return cls(
-            np.where(enough, total / some, np.nan),
-            np.where(enough, noise / np.sqrt(some), np.nan),
-        )
-
-
 def _low_level(scan: Scan) -> tuple[float, str]:
     """Return the low level of a scan, and what it lacks; "": nothing."""
     levels, count = np.unique(scan.levels, return_counts=True)
@@ -340,135 +327,55 @@ def _noise(scan: Scan) -> float:
     return float(max(deviation, float(steps.min()) / np.sqrt(12)))
 
 
-def _judged(zero: _Level, low: _Level, full: _Level, share: float, layout: SensorLayout) -> ReadOut:
-    """Return what three levels say; ``share``: of the drive at the low one."""
+def _judged(
+    zero: Level, low: Level, full: Level, share: float, layout: SensorLayout, held: bool | None
+) -> ReadOut:
+    """Return what three levels say.
+
+    Args:
+        zero, low, full: the levels.
+        share: of the drive at the low one.
+        layout: the array.
+        held: whether lines that are not selected are held; None: not stated.
+    """
     measured = np.isfinite(zero.mean) & np.isfinite(low.mean) & np.isfinite(full.mean)
     measured &= layout.present.ravel()
     everywhere = measured & (zero.mean >= TOP)
     short = measured & (low.mean >= TOP) & ~everywhere
-    tells = measured & ~short & ~everywhere & ~_in_parallel(short, layout)
-    answer = _Answer.of(zero, low, full, share)
-    answers = tells & (answer.response > _STANDS * answer.error)
-    silent = tells & (np.abs(answer.response) <= _STANDS * answer.error)
+    tells = measured & ~short & ~everywhere & ~in_parallel(short, layout)
+    answer = Answer.of(zero, low, full, share)
+    least = STANDS * answer.error
+    answers = tells & (answer.response > least)
+    silent = tells & (np.abs(answer.response) <= least)
+    if held is None:
+        held = holds_lines(answer.response, least, answers, silent, layout)
     usual = 0.0
     faint = np.zeros_like(tells)
-    evidence = np.where(answers, -CERTAIN_RATIO, 0.0)
+    evidence = np.where(answers & held, -CERTAIN_RATIO, 0.0)
     if answers.sum() >= MAJORITY * measured.sum() > 0:
-        healthy = _Healthy.of(answer.response[answers])
+        healthy = Healthy.of(answer.response[answers])
         usual = healthy.usual
-        evidence[silent] = healthy.of_silence(_STANDS * answer.error[silent])
-        faint = _on_faint_lines(answer.response, healthy, tells, layout)
+        evidence[silent] = healthy.of_silence(least[silent])
+        faint = on_faint_lines(answer.response, healthy, tells, layout)
     silent &= evidence > 0
     no_answer = silent | faint
-    at_supply = no_answer & (zero.mean > _STANDS * zero.error + _RESIDUE * usual)
-    alive = answers & answer.in_proportion & ~faint & (usual > 0)
+    at_supply = no_answer & (zero.mean > STANDS * zero.error + _RESIDUE * usual)
+    conducts = answers & answer.in_proportion & ~faint & (usual > 0)
     certain = short | everywhere | faint
     return ReadOut(
         layout,
         np.where(measured, answer.response, np.nan),
         np.where(measured, zero.mean, np.nan),
-        _STANDS * answer.error,
+        least,
         np.where(answers, answer.ratio, np.nan),
         np.where(certain, CERTAIN_RATIO, evidence),
         open=no_answer & ~at_supply,
         short=short,
         held=everywhere | at_supply,
-        alive=alive,
-        under_load=int((alive & (answer.response > _LOADED * usual)).sum()),
+        alive=conducts & held,
+        under_load=int((conducts & (answer.response > _LOADED * usual)).sum()),
+        incomplete="" if held or not conducts.any() else _MAY_FLOAT,
     )
-
-
-@dataclass(frozen=True)
-class _Answer:
-    """How each crossing answers the drive, ``[D]``."""
-
-    response: Floats
-    error: Floats
-    ratio: Floats
-    in_proportion: Mask
-
-    @classmethod
-    def of(cls, zero: _Level, low: _Level, full: _Level, share: float) -> _Answer:
-        saturated = full.mean >= TOP
-        slope = (full.mean - low.mean) / (1 - share)
-        # what is left at no drive: nothing, or what is there where the row floats
-        left = low.mean - share * slope
-        base = np.where(np.abs(left) <= np.abs(left - zero.mean), 0.0, zero.mean)
-        base = np.where(saturated & (low.mean < TOP), 0.0, base)
-        of_low = (low.mean - base) / share
-        error_of_low = np.hypot(low.error, zero.error) / share
-        response = np.where(saturated, of_low, slope)
-        error = np.where(saturated, error_of_low, np.hypot(full.error, low.error) / (1 - share))
-        usable = response > 0
-        ratio = np.divide(of_low, response, out=np.full_like(response, np.nan), where=usable)
-        of_ratio = np.divide(
-            error_of_low, response, out=np.full_like(response, np.inf), where=usable
-        )
-        apart = np.maximum(_IN_PROPORTION, _STANDS * of_ratio)
-        return cls(response, error, ratio, np.abs(ratio - 1) <= apart)
-
-
-def _on_faint_lines(response: Floats, healthy: _Healthy, tells: Mask, layout: SensorLayout) -> Mask:
-    """Return the crossings on rows and columns that answer faintly, bool ``[D]``."""
-    found = np.zeros(layout.n_cells, bool)
-    for line in layout.lines:
-        cells = layout.cells_on(line)
-        cells = cells[tells[cells]]
-        if line.kind not in ("row", "column") or len(cells) < _FEWEST:
-            continue
-        least = healthy.faint(len(cells))
-        if np.median(response[cells]) < least:
-            found[cells[response[cells] < least]] = True
-    return found
-
-
-def _in_parallel(short: Mask, layout: SensorLayout) -> Mask:
-    """Return the crossings that shorted ones join in parallel with another one, bool ``[D]``: with
-    (a, b) and (c, d) shorted, (a, d) and (c, b) lie between the same two wires."""
-    if not layout.is_matrix:
-        return np.zeros_like(short)
-    grid = layout.grid(short)
-    joined = grid.any(axis=2, keepdims=True) & grid.any(axis=1, keepdims=True) & ~grid
-    found: Mask = joined.reshape(-1)
-    return found
-
-
-@dataclass(frozen=True)
-class _Healthy:
-    """How healthy crossings answer: log response is normal.
-
-    Attributes:
-        usual: median response.
-        spread: standard deviation of its logarithm, of the middle half.
-        tail: the same, of the wider tail, which a line on ground may make.
-    """
-
-    usual: float
-    spread: float
-    tail: float
-
-    @classmethod
-    def of(cls, response: Floats) -> _Healthy:
-        """Return that of crossings which answer, ``[n]``."""
-        log = np.log(response)
-        middle = float(np.median(log))
-        half = 1.4826 * float(np.median(np.abs(log - middle)))
-        low, high = np.quantile(log, [LOW, 1 - LOW]).tolist()
-        tail = max(middle - low, high - middle) / -float(ndtri(LOW))
-        spread = max(_LEAST_SPREAD, half)
-        return cls(float(np.exp(middle)), spread, max(spread, tail))
-
-    def of_silence(self, least: Floats) -> Floats:
-        """Return the evidence of crossings that answer less than ``least``: how many healthy ones
-        do."""
-        as_silent = (np.log(least) - np.log(self.usual)) / self.tail
-        evidence: Floats = np.clip(-log_ndtr(as_silent), 0.0, CERTAIN_RATIO)
-        return evidence
-
-    def faint(self, crossings: int) -> float:
-        """Return the median response of so many that is less than chance gives."""
-        by_chance = _STANDS * _OF_MEDIAN * self.spread / np.sqrt(crossings)
-        return self.usual * float(min(_FAINT, np.exp(-by_chance)))
 
 
 def _reason(kind: FaultKind, cause: Cause, held: bool, layout: SensorLayout) -> str:

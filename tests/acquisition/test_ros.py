@@ -14,6 +14,8 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
+from adaptfault.acquisition.followed import BundleAt, Follower, Sensor
+from adaptfault.acquisition.watch import WAITING, Watch
 from adaptfault.data.calibration import Calibration
 from adaptfault.data.recordings.formats.message_arrays import arrays_at, join, put
 from adaptfault.imputation.restorer import Restorer
@@ -21,8 +23,7 @@ from adaptfault.robot.ros_diagnostics import Level, diagnostic_array, stale_arra
 from adaptfault.ros2 import parameters
 from adaptfault.ros2.parameters import DEFAULTS, Parameters, quoted, unknown
 from adaptfault.ros2.rounds import Part, Rounds
-from adaptfault.ros2.sensor import Follower, Sensor
-from adaptfault.ros2.watch import WAITING, Watch
+from adaptfault.ros2.sensor import sensor_of
 from diagnostics import (
     Fault,
     FaultKind,
@@ -34,6 +35,8 @@ from diagnostics import (
     line_fault,
     lose_frames,
 )
+from diagnostics.simulation.circuit import Circuit, StuckCell
+from diagnostics.simulation.scan import scan_circuit
 
 LAYOUT = SensorLayout.paper()
 
@@ -176,13 +179,11 @@ PACKAGE = Path(__file__).parents[2] / "examples" / "ros2"
 
 def test_the_node_takes_its_array_from_its_parameters(tmp_path):
     given = Parameters(layout="2x6x5", full_scale=3.3, unit="V", rate=50.0)
-    assert Sensor.from_parameters(given).layout == SensorLayout(
-        2, 6, 5, full_scale=3.3, unit="V", rate=50
-    )
+    assert sensor_of(given).layout == SensorLayout(2, 6, 5, full_scale=3.3, unit="V", rate=50)
     (tmp_path / "layout.json").write_text(json.dumps(LAYOUT.to_dict()))
-    assert Sensor.from_parameters(Parameters(layout=str(tmp_path / "layout.json"))).layout == LAYOUT
+    assert sensor_of(Parameters(layout=str(tmp_path / "layout.json"))).layout == LAYOUT
     with pytest.raises(ValueError, match="give the parameter bundle, or the parameter layout"):
-        Sensor.from_parameters(Parameters())
+        sensor_of(Parameters())
     with pytest.raises(ValueError, match=f"frames of 7 values come, expected {LAYOUT.n_cells}"):
         watch_of(SelfDiagnosis(LAYOUT)).put(np.zeros(7))
 
@@ -445,20 +446,20 @@ def test_the_node_converts_counts_with_the_calibration_of_the_bundle_and_restore
 
 
 def test_the_node_restores_nothing_without_a_bundle_or_a_frame_of_its_sensor(made_bundle):
-    assert Sensor.from_parameters(Parameters(layout="2x6x5")).restorer is None
-    assert Sensor.from_parameters(Parameters(bundle=str(made_bundle), restored="")).restorer is None
+    assert sensor_of(Parameters(layout="2x6x5")).restorer is None
+    assert sensor_of(Parameters(bundle=str(made_bundle), restored="")).restorer is None
     assert watch_of(SelfDiagnosis(LAYOUT)).restore(np.zeros(220)) is None
-    watch = Watch(Sensor.from_parameters(Parameters(bundle=str(made_bundle))))
+    watch = Watch(sensor_of(Parameters(bundle=str(made_bundle))))
     assert watch.restore(np.zeros(7)) is None
     assert watch.restore(np.full(60, 1e30)).shape == (60,)
     with pytest.raises(ValueError, match="the bundle states unit"):
-        Sensor.from_parameters(Parameters(bundle=str(made_bundle), unit="V"))
+        sensor_of(Parameters(bundle=str(made_bundle), unit="V"))
 
 
 def test_the_node_puts_exchanged_wires_back_as_the_version_that_the_bundle_runs(
     bundle, small_grasps
 ):
-    follower = Follower(Parameters(bundle=str(bundle.path)), clock=lambda: 0.0)
+    follower = Follower(BundleAt(bundle.path).sensor, bundle.path, clock=lambda: 0.0)
     watch = Watch(follower.sensor)
     rows = bundle.layout.grid(np.arange(bundle.layout.n_cells)).copy()
     rows[0, [1, 4]] = rows[0, [4, 1]]
@@ -480,15 +481,39 @@ def test_the_node_puts_exchanged_wires_back_as_the_version_that_the_bundle_runs(
     np.testing.assert_array_equal(watch.restore(frames[5][wired])[others], frames[5][others])
 
 
+def test_a_scan_of_the_read_out_is_evidence_of_the_node(small_grasps):
+    layout = small_grasps.layout
+    now = [1000.0]
+    restorer = Restorer(layout).fit(small_grasps.frames[::7])
+    watch = watch_of(SelfDiagnosis(layout), clock=lambda: now[0], restorer=restorer)
+    frame = np.zeros(layout.n_cells)
+    for _ in range(100):
+        take(watch, frame)
+    idle = np.full(layout.n_cells, 0.01)
+    scan = scan_circuit(Circuit(layout, faults=(StuckCell(33, np.inf),)), idle, repeats=5)
+    for level, values in zip(scan.levels, scan.readings, strict=True):
+        watch.scan(level, values)
+    watch.diagnostics(5.0)
+    assert watch.read_out is None  # it may go on
+    now[0] += 2.1
+    take(watch, frame)
+    told = levels(watch.diagnostics(5.0))
+    assert [fault.cells for fault in watch.read_out.faults] == [(33,)]
+    assert Level.WARN in told.values()
+    assert watch.repair.fault_set == FaultSet((33,), layout.n_cells)
+    with pytest.raises(ValueError, match="a frame of a scan has level 2 and 7 values, expected 0"):
+        watch.scan(2.0, np.zeros(7))
+
+
 def test_a_bundle_that_can_no_longer_be_read_leaves_the_node_as_it_is(bundle, caplog):
-    follower = Follower(Parameters(bundle=str(bundle.path)), clock=lambda: 0.0)
+    follower = Follower(BundleAt(bundle.path).sensor, bundle.path, clock=lambda: 0.0)
     bundle.deploy(1)
     for file in bundle.path.glob("bundle*.json"):
         file.unlink()
     assert follower.poll() is None
     follower._loading.join()
     assert follower.poll() is None
-    assert "the node goes on as before" in caplog.text
+    assert "all goes on as before" in caplog.text
 
 
 def test_values_are_written_into_the_arrays_of_a_message_in_their_type():
@@ -522,5 +547,5 @@ def test_an_image_gives_its_pixels_without_the_padding_of_its_rows(encoding, dty
 
 
 def test_importing_the_package_imports_no_ros():
-    code = "import sys, adaptfault, adaptfault.ros2.watch; assert 'rclpy' not in sys.modules"
+    code = "import sys, adaptfault, adaptfault.ros2.sensor; assert 'rclpy' not in sys.modules"
     subprocess.run([sys.executable, "-c", code], check=True)

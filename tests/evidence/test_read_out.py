@@ -4,13 +4,16 @@
 step.
 """
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from diagnostics import FaultKind, Line, SelfDiagnosis, SensorLayout, Verdict
-from diagnostics.evidence.read_out import REPEATS, ReadOut, Scan, judge_scan, with_scan
+from diagnostics.evidence.crossings import REPEATS
+from diagnostics.evidence.read_out import ReadOut, Scan, judge_scan, with_scan
 from diagnostics.simulation.circuit import Circuit, CutLine, ShortedLine, StuckCell
 from diagnostics.simulation.scan import LOW, scan_circuit
 
@@ -18,12 +21,19 @@ LAYOUT = SensorLayout(1, 8, 7)
 READ_OUTS = {"grounded": 100.0, "virtual ground": 1.0}
 
 
-def scan_of(*faults, seed: int = 0, load_ohms: float = 100.0, forces=None, noise=1.0) -> Scan:
+def scan_of(
+    *faults, seed: int = 0, load_ohms: float = 100.0, forces=None, noise=1.0, read_out="grounded"
+) -> Scan:
     rng = np.random.default_rng(seed)
     idle = rng.uniform(0, 0.02, LAYOUT.n_cells)
-    circuit = Circuit(LAYOUT, "grounded", faults, load_ohms=load_ohms, leak_ohms=1e7)
+    circuit = Circuit(LAYOUT, read_out, faults, load_ohms=load_ohms, leak_ohms=1e7)
     loads = idle if forces is None else np.maximum(idle, forces)
-    return scan_circuit(circuit, loads, seed=seed, noise=noise)
+    return held(scan_circuit(circuit, loads, seed=seed, noise=noise))
+
+
+def held(scan: Scan) -> Scan:
+    """Return a scan that states that lines are held."""
+    return replace(scan, holds_lines=True)
 
 
 def blamed(found: ReadOut) -> set[int]:
@@ -76,6 +86,68 @@ def test_a_line_on_the_supply_or_on_ground_is_one_fault_and_no_other_cell_is_bla
     assert found.alive.sum() == LAYOUT.n_cells - len(fault.cells)
 
 
+LEAKS = st.sampled_from([1e12, 1e8, 1e7, 3e6, 1e6])
+CONDUCTION = st.sampled_from([0.0, 0.3, 1.0])  # deviation of its logarithm
+
+
+@given(st.integers(0, 10**6), cells, LEAKS, CONDUCTION, loads, st.sampled_from([0.5, 2.0]))
+def test_where_lines_float_no_open_crossing_is_alive(seed, cell, leak, spread, load, noise):
+    circuit = Circuit(
+        LAYOUT, "floating", (StuckCell(cell, np.inf),), load_ohms=load, leak_ohms=leak
+    )
+    idle = np.clip(idle_of(spread, seed), 0.001, None)
+    found = judge_scan(scan_circuit(circuit, idle, seed=seed, noise=noise), LAYOUT)
+    assert not found.alive[cell]
+    assert blamed(found) <= {cell}
+    assert found.faults or "stay untested" in str(found)
+
+
+@given(
+    st.integers(0, 10**6),
+    st.sets(cells, max_size=4),
+    st.sampled_from([None, 0, 2]),
+    st.sampled_from([1e12, 1e8, 2e7]),
+    CONDUCTION,
+)
+def test_where_lines_float_none_of_several_is_alive(seed, opens, before, leak, spread):
+    faults = [StuckCell(cell, np.inf) for cell in opens]
+    if before is not None:
+        faults.append(CutLine(Line(0, "row", 3), before))
+        opens = opens | set(LAYOUT.cells_on(Line(0, "row", 3))[before:].tolist())
+    circuit = Circuit(LAYOUT, "floating", tuple(faults), leak_ohms=leak)
+    found = judge_scan(scan_circuit(circuit, idle_of(spread, seed), seed=seed), LAYOUT)
+    assert not found.alive[list(opens)].any()
+
+
+@given(st.integers(0, 10**6), loads)
+def test_crossings_that_conduct_differently_show_that_lines_are_held(seed, load):
+    layout = SensorLayout(1, 16, 16)
+    idle = np.random.default_rng(seed).uniform(0, 0.02, layout.n_cells)
+    scan = scan_circuit(Circuit(layout, load_ohms=load, leak_ohms=1e7), idle, seed=seed)
+    assert judge_scan(scan, layout).alive.all()
+
+
+def test_where_crossings_conduct_alike_the_scan_has_to_state_that_lines_are_held():
+    idle = np.full(LAYOUT.n_cells, 0.01)
+    scan = scan_circuit(Circuit(LAYOUT), idle)
+    unknown = judge_scan(scan, LAYOUT)
+    assert not unknown.alive.any()
+    assert not unknown.faults
+    assert "state --lines-held, or Scan(..., holds_lines=True)" in unknown.incomplete
+    assert judge_scan(held(scan), LAYOUT).alive.all()
+    assert not judge_scan(replace(scan, holds_lines=False), LAYOUT).alive.any()
+    broken = Circuit(LAYOUT, faults=(StuckCell(9, np.inf),))
+    found = judge_scan(scan_circuit(broken, idle), LAYOUT)
+    assert blamed(found) == {9}
+    assert found.alive.sum() == LAYOUT.n_cells - 1
+
+
+@pytest.mark.parametrize("read_out", ["floating_rows", "floating_columns"])
+def test_one_side_that_floats_hides_no_open_crossing(read_out):
+    found = judge_scan(scan_of(StuckCell(9, np.inf), read_out=read_out), LAYOUT)
+    assert blamed(found) == {9}
+
+
 def test_of_two_crossings_that_shorts_join_in_parallel_nothing_is_told():
     shorts = [StuckCell(LAYOUT.cell(0, *at), 0.0) for at in ((1, 2), (4, 6))]
     found = judge_scan(scan_of(*shorts, StuckCell(LAYOUT.cell(0, 1, 6), np.inf)), LAYOUT)
@@ -88,7 +160,7 @@ def test_of_two_crossings_that_shorts_join_in_parallel_nothing_is_told():
 def test_the_order_of_the_frames_does_not_matter(seed):
     scan = scan_of(StuckCell(5, np.inf), StuckCell(17, 0.0))
     order = np.random.default_rng(seed).permutation(len(scan.levels))
-    found = judge_scan(Scan(scan.levels[order], scan.readings[order]), LAYOUT)
+    found = judge_scan(Scan(scan.levels[order], scan.readings[order], True), LAYOUT)
     assert blamed(found) == {5, 17}
 
 
@@ -96,7 +168,7 @@ def test_the_order_of_the_frames_does_not_matter(seed):
 def test_an_interrupted_scan_says_what_it_lacks_or_tells_the_same(first, last):
     scan = scan_of(StuckCell(5, np.inf))
     kept = slice(min(first, last), max(first, last) + 1)
-    found = judge_scan(Scan(scan.levels[kept], scan.readings[kept]), LAYOUT)
+    found = judge_scan(Scan(scan.levels[kept], scan.readings[kept], True), LAYOUT)
     count = [int((scan.levels[kept] == level).sum()) for level in (0.0, LOW, 1.0)]
     if min(count) < REPEATS:
         assert "incomplete" in found.incomplete
@@ -111,7 +183,7 @@ def test_missing_readings_of_a_cell_leave_it_untested():
     scan = scan_of()
     readings = scan.readings.copy()
     readings[:, 9] = np.nan
-    found = judge_scan(Scan(scan.levels, readings), LAYOUT)
+    found = judge_scan(replace(scan, readings=readings), LAYOUT)
     assert not found.faults
     assert np.flatnonzero(~found.alive).tolist() == [9]
 
@@ -160,10 +232,11 @@ def test_no_healthy_crossing_is_blamed_however_differently_they_conduct(seed, sp
 def test_a_healthy_scan_tells_which_silent_crossing_is_open(seed, spread):
     idle = idle_of(spread, seed)
     circuit = Circuit(LAYOUT, idle_ohms=1e9)
-    healthy = judge_scan(scan_circuit(circuit, idle, seed=seed), LAYOUT)
+    healthy = judge_scan(held(scan_circuit(circuit, idle, seed=seed)), LAYOUT)
     cell = int(np.nanargmax(np.where(healthy.alive, healthy.response, np.nan)))
     broken = circuit.with_faults(StuckCell(cell, np.inf))
-    found = judge_scan(scan_circuit(broken, idle, seed=seed + 1), LAYOUT).since(healthy)
+    today = held(scan_circuit(broken, idle, seed=seed + 1))
+    found = judge_scan(today, LAYOUT).since(healthy)
     assert blamed(found) == {cell}
 
 
@@ -193,7 +266,7 @@ def test_a_fault_of_the_log_stays_where_its_crossing_answers_the_scan(fitted, gr
     diagnosis = fitted.diagnose(frames)
     assert 44 in diagnosis.fault_set
     circuit = Circuit(layout, "grounded")
-    scan = scan_circuit(circuit, np.full(layout.n_cells, 0.01))
+    scan = held(scan_circuit(circuit, np.full(layout.n_cells, 0.01)))
     found = with_scan(diagnosis, judge_scan(scan, layout))
     assert found.fault_set == diagnosis.fault_set
     assert (found.verdicts[found.fault_set.healthy] == Verdict.ALIVE).all()

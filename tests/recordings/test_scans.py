@@ -142,3 +142,18 @@ def test_diagnose_tells_what_the_scan_says_with_nobody_touching(tmp_path, capsys
     assert fault["cells"] == [7]
     assert "does not answer the scan" in fault["reason"]
     assert f"scan: {D} of {D} cells tested" in captured.err
+
+
+def test_where_crossings_conduct_alike_the_option_states_that_lines_are_held(tmp_path, capsys):
+    healthy = scan_circuit(Circuit(SensorLayout(1, 6, 5)), np.full(D, 0.01), repeats=5)
+    frames = np.concatenate([np.full((40, D), 2), healthy.readings])
+    (tmp_path / "layout.json").write_text(json.dumps(LAYOUT.to_dict()))
+    levels = np.concatenate([np.full(40, np.nan), healthy.levels])
+    (tmp_path / "log.csv").write_text(table(levels, frames))
+    untested = {}
+    for stated in ([], ["--lines-held"]):
+        main(["diagnose", str(tmp_path), "--json", *stated])
+        captured = capsys.readouterr()
+        untested[len(stated)] = json.loads(captured.out)["coverage"]["untested"]
+        assert ("state --lines-held" in captured.err) == (not stated)
+    assert untested == {0: list(range(D)), 1: []}

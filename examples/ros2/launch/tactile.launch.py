@@ -14,6 +14,8 @@ PARAMETERS = {
     "bundle": ("", str),
     "trust": ("", str),
     "restored": ("/tactile/restored", str),
+    "scan": ("", str),
+    "lines_held": ("false", bool),
     "layout": ("", str),
     "full_scale": ("0.0", float),
     "unit": ("", str),

@@ -3,6 +3,7 @@ cells that move, and broken wires. All readings are whole counts."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -57,7 +58,6 @@ def made_log(
     length = min(LENGTHS.get(kind, 6), len(pool))
     log = [pool[i] for i in rng.choice(len(pool), length, replace=False)]
     faults: list[Fault] = []
-    wires: list[Fault] = []
     if kind == "disturbed":
         change = DISTURBANCES[number % len(DISTURBANCES)]
         full = layout.full_scale
@@ -76,17 +76,32 @@ def made_log(
     onset = round(0.6 * len(whole)) if kind == "dead later" else 0
     seed = int(rng.integers(1 << 30))
     read = inject(whole, [replace(fault, onset=onset) for fault in faults], layout, seed=seed)
-    wrong = of.differs(whole, read, layout)
+    return of.parted(read, log), truth_of(kind, whole, read, faults, layout)
+
+
+def truth_of(
+    kind: str, healthy: of.Frames, read: of.Frames, faults: Sequence[Fault], layout: SensorLayout
+) -> dict[str, Any]:
+    """Return the truth of a log, as :class:`~adaptfault.bench.score.Score` takes it.
+
+    Args:
+        kind: of the log, a name.
+        healthy: frames ``[T, D]`` without the faults.
+        read: the same with them.
+        faults: what is broken; those of a line are wires.
+        layout: the array.
+    """
+    wrong = of.differs(healthy, read, layout)
     testable = wrong.sum(axis=0) >= of.TESTABLE
-    told = {
+    wires = [(fault.line, list(fault.cells)) for fault in faults if fault.line is not None]
+    return {
         "kind": kind,
         "dead": sorted(cell for fault in faults for cell in fault.cells),
         "testable": np.flatnonzero(testable).tolist(),
-        "wires": [(f.line.pad, f.line.kind, f.line.index) for f in wires if f.line is not None],
-        "nameable": all(testable[list(f.cells)].sum() >= LEAST_OF_WIRE for f in wires),
+        "wires": [(line.pad, line.kind, line.index) for line, _ in wires],
+        "nameable": all(testable[cells].sum() >= LEAST_OF_WIRE for _, cells in wires),
         "shows": "".join(map(str, wrong.any(axis=1).astype(int))),
     }
-    return of.parted(read, log), told
 
 
 def broken_wires(layout: SensorLayout, number: int, rng: np.random.Generator) -> list[Fault]:

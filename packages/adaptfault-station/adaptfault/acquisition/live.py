@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adaptfault.acquisition.ordering import Frame
-from adaptfault.acquisition.relay import FrameRepair
+from adaptfault.acquisition.relay import FrameRepair, in_place
 from adaptfault.acquisition.session import Event, Session
 from adaptfault.robot.ros_diagnostics import Level, diagnostic_array, stale_array
 from adaptfault.viewers.mcap_file import McapArray, McapMessages, check_mcap
@@ -183,7 +183,7 @@ class _Device:
         self.readings.append(frame.values if version is None else version.undo(frame.values))
         if self.repair is not None:
             self.repair.found(session.fault_set)
-            whole, _, _ = self.repair.in_place(frame.values, frame.values, version)
+            whole, _, _ = in_place(self.repair, frame.values, frame.values, version)
             self.restored.append(whole)
         faulty = session.fault_set if self.repair is None else self.repair.fault_set
         found = (session.watcher.evaluated, faulty)

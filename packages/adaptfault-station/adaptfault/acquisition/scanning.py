@@ -8,6 +8,7 @@ time of lost frames. What a scan lacks is told, and nothing is said of cells the
 from __future__ import annotations
 
 from collections import deque
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,14 +27,16 @@ class Scans:
 
     Args:
         layout: the array.
+        lines_held: whether the read-out holds lines that it does not select; None: not stated.
 
     Attributes:
         time: seconds that frames of scans took so far.
         last: the last scan that ended; None: there was none.
     """
 
-    def __init__(self, layout: SensorLayout) -> None:
+    def __init__(self, layout: SensorLayout, lines_held: bool | None = None) -> None:
         self.layout = layout
+        self.lines_held = lines_held
         self.time = 0.0
         self.last: Scan | None = None
         self._frames: deque[tuple[float, NDArray[np.float64]]] = deque(maxlen=_MOST)
@@ -54,12 +57,17 @@ class Scans:
         if self._began is not None:
             self.time += max(frame.time - self._began, 0.0)
             self._began = None
-        return self.end() if frame.time - self._latest > ENDS else None
+        return self.ended(frame.time)
+
+    def ended(self, now: float) -> ReadOut | None:
+        """End the scan where its last frame is long past; return what it says, None where there is
+        none, or it goes on."""
+        return self.end() if now - self._latest > ENDS else None
 
     def end(self) -> ReadOut | None:
         """End the scan; return what it says, None where there is none."""
         if not self._frames:
             return None
-        self.last = Scan.of(list(self._frames))
+        self.last = replace(Scan.of(list(self._frames)), holds_lines=self.lines_held)
         self._frames.clear()
         return judge_scan(self.last, self.layout)

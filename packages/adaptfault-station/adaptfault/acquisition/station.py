@@ -73,6 +73,8 @@ class Station:
         calibration: converts received values into the layout's unit.
         on_event: called with each event in the event loop, instead of printing it.
         accumulate: tell one class for a whole contact, see :class:`Session`; needs a bundle.
+        lines_held: whether the read-out holds lines that it does not select, in scans of itself;
+            None: not stated.
         sets: tell the set of classes of each window that holds the true one with probability
             1 - ``sets``, see :class:`Predictor`; needs a bundle.
         as_json: one JSON object per line.
@@ -107,6 +109,7 @@ class Station:
         on_event: Callable[[Event], None] | None = None,
         accumulate: bool = False,
         sets: float | None = None,
+        lines_held: bool | None = None,
         as_json: bool = False,
         quiet: bool = False,
     ) -> None:
@@ -123,6 +126,7 @@ class Station:
         self.on_event = self._print if on_event is None else on_event
         self.accumulate = accumulate
         self.sets = sets
+        self.lines_held = lines_held
         if accumulate and bundle is None:
             raise ValueError("--accumulate needs BUNDLE: classes are accumulated over a contact")
         if sets is not None and bundle is None:
@@ -347,7 +351,7 @@ class Station:
             recorder=recorder,
             rule=self._rule,
             accumulate=self.accumulate,
-            scans=Scans(self.layout),
+            scans=Scans(self.layout, self.lines_held),
         )
         session.command(self._command)
         return session

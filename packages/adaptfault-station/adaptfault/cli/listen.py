@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from adaptfault.cli.command import argument, option
 from adaptfault.cli.paths import Read, Written, WrittenFolder
 from adaptfault.cli.reading import CalibratedArray
-from adaptfault.cli.shared_options import Trusting, metrics_option
+from adaptfault.cli.shared_options import Trusting, lines_held_option, metrics_option
 
 if TYPE_CHECKING:
     from adaptfault.acquisition import Station
@@ -79,6 +79,7 @@ class Listen(Trusting, CalibratedArray):
     seconds: float | None = option("end after so long", "S")
     frames: int | None = option("end after so many frames", "N")
     metrics: Written | None = metrics_option()
+    lines_held: bool = lines_held_option()
 
     def run(self) -> int:
         """Listen until the end that the options or stdin give; files are closed in any case."""
@@ -139,6 +140,7 @@ def _station(args: Listen) -> Station:
         calibration=tables,
         accumulate=args.accumulate,
         sets=args.sets,
+        lines_held=args.lines_held or None,
         as_json=args.json,
         quiet=args.quiet,
     )

@@ -1,6 +1,7 @@
 """The lifecycle node: configure opens the bundle, activate subscribes. Needs rclpy.
 
-The executor's one thread restores frames, another one monitors them: :mod:`adaptfault.ros2.watch`.
+The executor's one thread restores frames, another one monitors them
+(:mod:`adaptfault.acquisition.watch`).
 """
 
 from __future__ import annotations
@@ -20,12 +21,13 @@ from rclpy.executors import ExternalShutdownException
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 
+from adaptfault.acquisition.followed import Follower
+from adaptfault.acquisition.watch import Watch
 from adaptfault.data.recordings.formats.message_arrays import arrays_at, join, put
 from adaptfault.ros2.messages import choose_field, diagnostics_message, message_type, stamp_of
 from adaptfault.ros2.parameters import DEFAULTS, Parameters, quoted, unknown
 from adaptfault.ros2.rounds import Part, Rounds
-from adaptfault.ros2.sensor import Follower
-from adaptfault.ros2.watch import Watch
+from adaptfault.ros2.sensor import sensor_of
 
 NAME = "tactile_diagnostics"
 
@@ -80,9 +82,14 @@ class TactileDiagnostics(LifecycleNode):  # type: ignore[misc]
             raise ValueError(f"parameter topic {given.topic!r}: name each topic once")
         self._type = message_type(given.topic_type)
         self._field = choose_field(self._type, given.field)
-        self._follower = Follower(given)
+        self._follower = Follower(partial(sensor_of, given), given.bundle or None)
         sensor = self._follower.sensor
-        self.watch = Watch(sensor, name=given.name, hardware_id=given.hardware_id)
+        self.watch = Watch(
+            sensor,
+            name=given.name,
+            hardware_id=given.hardware_id,
+            lines_held=given.lines_held or None,
+        )
         self._diagnostics = self.create_lifecycle_publisher(DiagnosticArray, "/diagnostics", 1)
         self._publishers_made.append(self._diagnostics)
         self._whole = []
@@ -110,6 +117,10 @@ class TactileDiagnostics(LifecycleNode):  # type: ignore[misc]
         for i, topic in enumerate(topics):
             take = partial(self._take, i)
             self._subscriptions_made.append(self.create_subscription(self._type, topic, take, qos))
+        if self.parameters.scan:
+            self._subscriptions_made.append(
+                self.create_subscription(self._type, self.parameters.scan, self._take_scan, qos)
+            )
         return done
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -152,6 +163,13 @@ class TactileDiagnostics(LifecycleNode):  # type: ignore[misc]
                 self._pass_on(frame)
         except ValueError as error:
             self.get_logger().warning(f"frame dropped: {error}", throttle_duration_sec=5.0)
+
+    def _take_scan(self, message: Any) -> None:
+        try:
+            level, *values = join(arrays_at(message, self._field), np.float64).tolist()
+            self.watch.scan(level, np.array(values))
+        except ValueError as error:
+            self.get_logger().warning(f"scan dropped: {error}", throttle_duration_sec=5.0)
 
     def _pass_on(self, frame: list[Part]) -> None:
         """Publish a frame whole, and have it monitored."""

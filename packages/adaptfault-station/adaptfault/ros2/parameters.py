@@ -40,6 +40,9 @@ class Parameters:
             checked.
         restored: topic of the restored frames, one for each ``topic``; "" = none. Needs a bundle.
             Of several topics the default is each with "/restored" behind it.
+        scan: topic of the scans of a read-out that tests itself, of the same type: the level, then
+            one value a cell; "" = none.
+        lines_held: whether the read-out holds lines that it does not select in a scan.
         layout: without a bundle: a layout file, or a shape as 2x11x10.
         full_scale, unit, rate: override those of ``layout``; 0 and "" keep them.
         name: begins the name of each status, for robots with several sensors.
@@ -53,6 +56,8 @@ class Parameters:
     bundle: str = ""
     trust: str = ""
     restored: str = "/tactile/restored"
+    scan: str = ""
+    lines_held: bool = False
     layout: str = ""
     full_scale: float = 0.0
     unit: str = ""

@@ -1,4 +1,4 @@
-"""The work of the node: restores frames, monitors them, and states their diagnosis. Needs no ROS.
+"""Restores the frames of a running sensor, monitors them, and states their diagnosis.
 
 The thread that receives frames calls all methods but :meth:`Watch.work`, which belongs to a thread
 of its own: to monitor a frame of a large array may take longer than the time between two frames,
@@ -17,11 +17,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptfault.acquisition import FrameRepair
+from adaptfault.acquisition.followed import Sensor
+from adaptfault.acquisition.ordering import Frame
+from adaptfault.acquisition.relay import FrameRepair, in_place
+from adaptfault.acquisition.scanning import Scans
 from adaptfault.inspection.converter_range import within_range
 from adaptfault.robot.ros_diagnostics import Level, diagnostic_array, stale_array
-from adaptfault.ros2.sensor import Sensor
-from diagnostics import Fault, FaultSet, Monitor
+from diagnostics import Fault, FaultSet, Monitor, ReadOut, with_scan
 
 GRACE = 5.0  # seconds after the start in which no frame is a WARN, and STALE afterwards
 SILENCE = 2.0  # seconds without a frame, after which everything is STALE; at least so many periods:
@@ -38,6 +40,7 @@ class Watch:
     Args:
         sensor: as the bundle or the layout states it.
         name, hardware_id: of :func:`~adaptfault.robot.ros_diagnostics.diagnostic_array`.
+        lines_held: of the scans of the read-out, as in :class:`diagnostics.Scan`.
         clock: seconds, never set back.
     """
 
@@ -47,6 +50,7 @@ class Watch:
         *,
         name: str = "tactile",
         hardware_id: str = "tactile",
+        lines_held: bool | None = None,
         clock: Callable[[], float] = monotonic,
     ) -> None:
         self.name = name
@@ -56,6 +60,8 @@ class Watch:
         self.layout = sensor.layout
         self.faulty = np.zeros(self.layout.n_cells, bool)  # as the monitor finds
         self.monitor = Monitor(sensor.diagnoser)
+        self.read_out: ReadOut | None = None  # what the last scan says
+        self._scans = Scans(self.layout, lines_held)
         self._changing = threading.Lock()  # held for moments, never while a frame is monitored
         self._comes = threading.Event()  # set where frames wait, or the work ends
         self.repair = self._repair_of(sensor)
@@ -84,12 +90,22 @@ class Watch:
         with self._changing:
             if other:
                 self.faulty[:] = False
+                self.read_out = None
             self.sensor = sensor
             self.monitor = monitor
             self.repair = repair
             found = self._found()
         if repair is not None:
             repair.found(found)
+
+    def remember(self, faulty: FaultSet) -> None:
+        """Take cells for faulty that an earlier watch of this sensor found, for as long as frames
+        read as they do now: this monitor never saw them work."""
+        with self._changing:
+            self.faulty |= faulty.mask
+            found = self._found()
+        if self.repair is not None:
+            self.repair.found(found)
 
     def restore(self, received: NDArray[np.float64]) -> NDArray[np.float64] | None:
         """Return the whole frame in the unit in which it came; None where nothing restores it.
@@ -99,11 +115,17 @@ class Watch:
         """
         if self.repair is None or received.size != self.layout.n_cells:
             return None
-        readings = within_range(_readings(received, self.sensor), self.layout)[0]
-        whole, _, _ = self.repair.in_place(
-            received, readings, self.sensor.version, self.sensor.calibration
-        )
+        whole, _, _ = self.restored(self.repair, received)
         return whole
+
+    def restored(
+        self, repair: Callable[..., Any], received: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_]]:
+        """Return the whole frame ``[D]``, which cells are restored, and which values are others
+        than those received, as :func:`~adaptfault.acquisition.relay.in_place`."""
+        readings = within_range(_readings(received, self.sensor), self.layout)[0]
+        sensor = self.sensor
+        return in_place(repair, received, readings, sensor.version, sensor.calibration)
 
     def put(self, received: NDArray[np.float64], time: float | None = None) -> None:
         """Take in one frame ``[D]``, to be monitored later: that takes longer than to restore it.
@@ -127,6 +149,35 @@ class Watch:
                 self._waiting.popleft()
                 self.left_out += 1
         self._comes.set()
+
+    def scan(self, level: float, values: NDArray[np.float64]) -> None:
+        """Take in one frame ``[D]`` of a scan of the read-out; the scan ends two seconds after its
+        last frame.
+
+        Args:
+            level: share of the drive, 0 to 1.
+            values: shares of the converter's range, 0 to 1, each where its cell answers.
+
+        Raises:
+            ValueError: another number of values than cells, or another level.
+        """
+        if values.size != self.layout.n_cells or not 0 <= level <= 1:
+            raise ValueError(
+                f"a frame of a scan has level {level:g} and {values.size} values, expected 0 to 1"
+                f" and {self.layout.n_cells}"
+            )
+        self.last = self.clock()
+        version = self.sensor.version
+        placed = values if version is None else values[version.source]
+        self._scans.add(Frame(self.name, self.last, placed, scan=float(level)))
+
+    def _end_scan(self, now: float) -> None:
+        """Take a scan that has ended for evidence: its broken cells are restored, too."""
+        found = self._scans.ended(now)
+        if found is not None:
+            self.read_out = found
+            cells = tuple(np.flatnonzero(found.broken).tolist())
+            self.remember(FaultSet(cells, found.broken.size))
 
     @property
     def waiting(self) -> bool:
@@ -184,6 +235,7 @@ class Watch:
             stamp: seconds since 1970.
         """
         now = self.clock()
+        self._end_scan(now)
         about: dict[str, Any] = {"stamp": stamp, "name": self.name, "hardware_id": self.hardware_id}
         if self.last is None:
             waited = now - self.started
@@ -197,6 +249,8 @@ class Watch:
         if evaluated is None:
             what = "the first frames are being evaluated"
             return stale_array(self.layout, what, level=Level.WARN, **about)
+        if self.read_out is not None:
+            evaluated = with_scan(evaluated, self.read_out)
         return diagnostic_array(evaluated, rate=self._rate(now), **about)
 
     def _rate(self, now: float) -> float | None:

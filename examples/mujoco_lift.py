@@ -9,7 +9,7 @@ it is has to be felt. A step takes 50 ms, and a policy gives for each step
 - whether the fixture lets go of the object (above 0.5); it never holds it again.
 
 An episode succeeds if the fixture has let go within ``PATIENCE`` steps, the object has slipped by
-less than ``SLIP`` a second later, and no pad has pressed harder than the object stands.
+less than ``SLIP`` when the gripper has carried it for 0.6 s, and no pad has pressed harder than the object stands.
 
 ``expert`` knows the object and the true force. Demonstrations disturb its actions and keep what it
 would have done (DART: Laskey, Lee, Fox, Dragan and Goldberg 2017).
@@ -25,18 +25,21 @@ import mujoco
 import numpy as np
 from mujoco_gripper import LAYOUT, MILLIMETRE, Floats, Object, loads, pose, scene
 
-FASTEST = 0.4 * MILLIMETRE  # that the fingers close in a step
+from diagnostics import Fault, inject
+
+FASTEST = 0.6 * MILLIMETRE  # that the fingers close in a step
 SERVO = 8000.0  # newtons a metre that the fingers are away from where they were sent
 STRONGEST = 120.0  # newtons of the drive, for both fingers
 TICKS = 10  # of the simulation in a step of 50 ms
-PATIENCE = 70
-CARRIED = 20  # steps that the object hangs in the gripper
+PATIENCE = 50
+CARRIED = 12  # steps that the object hangs in the gripper
 SLIP = 4 * MILLIMETRE
 FRAMES = 4  # of touch that a policy sees
 HORIZON = 8  # steps of an action chunk
 REPLAN = 2  # steps of a chunk that are carried out
 NOISE = 0.004  # of a reading, as a share of full scale
 STEPS = 4095  # of the converter
+GAIN = np.random.default_rng(0).lognormal(0, 0.1, LAYOUT.n_cells)  # of the cells of this sensor
 
 
 @dataclass(frozen=True)
@@ -72,13 +75,12 @@ class Episode:
 
     Args:
         seed: draws the object, how far the pads are away, and the noise of the readings.
-        kind: which of ``KINDS``; None: drawn.
+        faults: of the sensor, from the start.
     """
 
-    def __init__(self, seed: int, kind: int | None = None) -> None:
+    def __init__(self, seed: int, faults: Sequence[Fault] = ()) -> None:
         rng = np.random.default_rng([seed, 70])
-        drawn = int(rng.integers(len(KINDS)))
-        self.kind = KINDS[drawn if kind is None else kind]
+        self.kind = KINDS[int(rng.integers(len(KINDS)))]
         radius = rng.uniform(*self.kind.radius)
         size = (radius,) if self.kind is BALL else (radius, 30.0)
         away = rng.uniform(0, 9)
@@ -100,6 +102,7 @@ class Episode:
         self.step = 0
         self.let_go: int | None = None
         self.held_at = 0.0
+        self.stuck = readings_of(faults, seed)
         self.touch = [self._read()] * FRAMES
         self.state = [self._told()] * FRAMES
 
@@ -112,7 +115,7 @@ class Episode:
 
     @property
     def outcome(self) -> str:
-        """"lifted", "crushed", "dropped" or "not lifted"."""
+        """ "lifted", "crushed", "dropped" or "not lifted"."""
         if self.hardest > self.kind.crushed:
             return "crushed"
         if self.let_go is None:
@@ -150,10 +153,11 @@ class Episode:
         return float(self.data.qpos[4])
 
     def _read(self) -> Floats:
-        gain = np.random.default_rng(0).lognormal(0, 0.1, LAYOUT.n_cells)
-        share = loads(self.data) * gain / LAYOUT.full_scale
+        """Return the readings ``[D]`` in newtons, with the faults of this sensor."""
+        share = loads(self.data) * GAIN / LAYOUT.full_scale
         share = share + self.rng.normal(0, NOISE, LAYOUT.n_cells)
-        return (np.rint(np.clip(share, 0, 1) * STEPS) / STEPS).astype(np.float32)
+        read = np.rint(np.clip(share, 0, 1) * STEPS) / STEPS * LAYOUT.full_scale
+        return np.where(np.isnan(self.stuck[self.step]), read, self.stuck[self.step])
 
     def _told(self) -> Floats:
         """Return what the gripper says of itself: where it was sent, in centimetres, and whether
@@ -166,7 +170,7 @@ class Demonstration:
     """What the expert did with one object.
 
     Attributes:
-        touch: readings on the 0..1 scale, float32 ``[steps, D]``.
+        touch: readings in newtons, float32 ``[steps, D]``.
         state: what the gripper said, float32 ``[steps, 2]``.
         actions: of the expert, float32 ``[steps, 2]``.
     """
@@ -174,6 +178,17 @@ class Demonstration:
     touch: Floats
     state: Floats
     actions: Floats
+
+
+def readings_of(faults: Sequence[Fault], seed: int) -> Floats:
+    """Return what the faulty cells read in an episode, ``[steps, D]`` in newtons; NaN where a cell
+    works. None of these faults depends on the load."""
+    steps = PATIENCE + CARRIED + 1
+    readings = inject(np.zeros((steps, LAYOUT.n_cells)), faults, LAYOUT, seed=seed)
+    dead = np.zeros(LAYOUT.n_cells, bool)
+    for fault in faults:
+        dead[list(fault.cells)] = True
+    return np.where(dead, readings, np.nan)
 
 
 def demonstrate(seed: int, disturbance: float = 0.4) -> tuple[Demonstration, str]:
@@ -195,27 +210,24 @@ def demonstrate(seed: int, disturbance: float = 0.4) -> tuple[Demonstration, str
 Policy = Callable[[Floats, Floats], Floats]
 
 
-def rollouts(
-    policy: Policy, seeds: Sequence[int], *, broken: Callable[[Floats, int], Floats]
-) -> list[str]:
+def rollouts(policy: Policy, seeds: Sequence[int], faults: Sequence[Fault] = ()) -> list[str]:
     """Return the outcome of an episode of each seed.
 
     Args:
-        policy: maps touch ``[N, FRAMES, D]`` and state ``[N, FRAMES, 2]`` to chunks of actions
-            ``[N, HORIZON, 2]``.
+        policy: maps touch ``[N, FRAMES, D]`` on the 0..1 scale and state ``[N, FRAMES, 2]`` to
+            chunks of actions ``[N, HORIZON, 2]``.
         seeds: of the episodes.
-        broken: maps the readings ``[FRAMES, D]`` of a sensor without faults, and a seed, to those
-            that the policy gets.
+        faults: of the sensor.
     """
-    episodes = [Episode(seed) for seed in seeds]
-    while going := [i for i, episode in enumerate(episodes) if not episode.over]:
-        touch = np.stack([broken(np.stack(episodes[i].touch), seeds[i]) for i in going])
-        state = np.stack([np.stack(episodes[i].state) for i in going])
-        chunks = policy(touch, state)
-        for i, chunk in zip(going, chunks, strict=True):
+    episodes = [Episode(seed, faults) for seed in seeds]
+    while going := [episode for episode in episodes if not episode.over]:
+        touch = np.stack([episode.touch for episode in going]) / LAYOUT.full_scale
+        state = np.stack([episode.state for episode in going])
+        chunks = policy(touch.astype(np.float32), state)
+        for episode, chunk in zip(going, chunks, strict=True):
             for action in chunk[:REPLAN]:
-                if not episodes[i].over:
-                    episodes[i].act(action)
+                if not episode.over:
+                    episode.act(action)
     return [episode.outcome for episode in episodes]
 
 

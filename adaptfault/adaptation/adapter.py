@@ -27,22 +27,28 @@ class Adapter(FaultFreeModel):
 
     Args:
         model: the fault-free model, any module from x ``[N, T, D]`` (0..1 scale) to logits or
-            values ``[N, n]``. It never changes. Computation is on the CPU, unless :meth:`to` moves
+            values ``[N, n]``, or a policy from touch x and other inputs to actions of any shape, as
+            chunks ``[N, H, A]``. It never changes. Computation is on the CPU, unless :meth:`to` moves
             it.
         train, validation: fault-free windows; more than 2500 validation windows are thinned evenly.
         A regression has
-            targets y float ``[N, k]``.
+            targets y float ``[N, k]``, a policy actions of the shape that it returns. What else a
+            policy sees is their :attr:`~adaptfault.Windows.extra`, which no repair changes; their
+            recordings are its episodes, of which none is in both.
         layout: the array; None: ``model.layout``.
         features: feature vector for a new head: the name of a layer (its output), or a function of
             (module, x) that returns ``[N, p]``. None: the input of the last linear layer.
         task: "classification", "regression" or "auto" (from the shape of y).
         loss: of training, (outputs ``[B, n]``, y) -> scalar. None: cross entropy, or mean squared
             error.
+        touch: the model takes one dict of inputs, as a policy of LeRobot does, with touch under
+            this name. None: it takes touch first, and other inputs by name.
 
     Raises:
         TypeError: ``model`` is no torch module.
         ValueError: no windows or no layout; the model fails on a window, its output does not fit
-            the targets, or the named features cannot be found.
+            the targets, or the named features cannot be found; a policy that does not use touch, or
+            an episode in both sets of windows.
     """
 
     def adapt(

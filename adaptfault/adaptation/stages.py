@@ -31,7 +31,7 @@ from adaptfault.models.heads import (
 )
 from adaptfault.models.history import History
 from adaptfault.models.kernels import Views
-from adaptfault.models.network import as_tensor, logits_of
+from adaptfault.models.network import as_tensor, batches, logits_of
 from adaptfault.models.targets import calibrate, log_likelihood
 from adaptfault.models.training import train
 from adaptfault.models.value_units import ValueUnits, foldable
@@ -175,7 +175,8 @@ class Run:
         """Return the outputs ``[N, n]`` for the validation windows, each from a head fitted without
         it."""
         if self.logits is None:
-            self.logits = logits_of(self._quickly(self.reduced), self.validation.x)
+            windows = self.validation
+            self.logits = logits_of(self._quickly(self.reduced), windows.x, windows.extra)
         return self.logits
 
     def accuracy(self) -> float:
@@ -264,7 +265,7 @@ class Run:
         A model without features keeps its own head.
         """
         if not self.fault_free.has_features:
-            return None, logits_of(reduced, self.validation.x)
+            return None, logits_of(reduced, self.validation.x, self.validation.extra)
         if self._too_long(reduced, len(self.training) + len(self.validation)):
             return None
         used = evenly(len(self.training), MOST_WINDOWS - len(self.validation))
@@ -318,9 +319,10 @@ class Run:
         """Return the views of windows, computed in batches, on the device of the adapter."""
         quick = self._quickly(reduced.eval())
         with torch.no_grad():
-            views = [
-                quick.views(x.to(self.device)) for x in torch.split(as_tensor(windows.x), _BATCH)
-            ]
+            views = []
+            for x, extra in batches(as_tensor(windows.x), windows.extra, _BATCH):
+                others = {name: values.to(self.device) for name, values in extra.items()}
+                views.append(quick.views(x.to(self.device), **others))
         return Views(*(torch.cat(parts) for parts in zip(*views, strict=True)))
 
     def _too_long(self, reduced: ReducedModel, n: int) -> bool:
@@ -369,7 +371,7 @@ class Run:
         training, validation = self.training, self.validation
         units = None
         values = self.fault_free.task == "regression" and self.fault_free.loss is None
-        if values and foldable(reduced.network):
+        if values and foldable(reduced.network, training.extra):
             units = ValueUnits.of(training)
             if not fresh:
                 units.unfold(reduced.network)

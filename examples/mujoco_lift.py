@@ -9,7 +9,8 @@ it is has to be felt. A step takes 50 ms, and a policy gives for each step
 - whether the fixture lets go of the object (above 0.5); it never holds it again.
 
 An episode succeeds if the fixture has let go within ``PATIENCE`` steps, the object has slipped by
-less than ``SLIP`` when the gripper has carried it for 0.6 s, and no pad has pressed harder than the object stands.
+less than ``SLIP`` when the gripper has carried it for 0.6 s, and no pad has pressed harder than the
+object stands.
 
 ``expert`` knows the object and the true force. Demonstrations disturb its actions and keep what it
 would have done (DART: Laskey, Lee, Fox, Dragan and Goldberg 2017).

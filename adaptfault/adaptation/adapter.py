@@ -28,8 +28,8 @@ class Adapter(FaultFreeModel):
     Args:
         model: the fault-free model, any module from x ``[N, T, D]`` (0..1 scale) to logits or
             values ``[N, n]``, or a policy from touch x and other inputs to actions of any shape, as
-            chunks ``[N, H, A]``. It never changes. Computation is on the CPU, unless :meth:`to` moves
-            it.
+            chunks ``[N, H, A]``. It never changes. Computation is on the CPU, unless :meth:`to`
+            moves it.
         train, validation: fault-free windows; more than 2500 validation windows are thinned evenly.
         A regression has
             targets y float ``[N, k]``, a policy actions of the shape that it returns. What else a

@@ -188,8 +188,15 @@ def _wrapped(
     if isinstance(model, AnyModel) or (isinstance(model, TactileTransformer) and features is None):
         return model
     few = train.select(slice(0, 8))
-    extra = tensors_of(few.extra)
-    return AnyModel.probe(model, layout, as_tensor(few.x), features, extra=extra, touch=touch)
+    return AnyModel.probe(
+        model,
+        layout,
+        as_tensor(few.x),
+        features,
+        extra=tensors_of(few.extra),
+        touch=touch,
+        actions=few.y.ndim > 2,
+    )
 
 
 def _check_windows(train: Windows, validation: Windows) -> None:
@@ -257,7 +264,7 @@ def _check_targets(model: Network, task: Task, *parts: Windows) -> None:
     name = type(model.module if isinstance(model, AnyModel) else model).__name__
     shape = getattr(model, "shape", (model.n_classes,))
     for windows in parts:
-        if len(shape) > 1 and windows.y.shape[1:] != shape:
+        if max(len(shape) + 1, windows.y.ndim) > 2 and windows.y.shape[1:] != shape:
             raise ValueError(
                 f"{name} returns actions [N, {', '.join(map(str, shape))}], the targets are"
                 f" {list(windows.y.shape)}: give what it should return for each window"

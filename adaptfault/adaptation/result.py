@@ -88,7 +88,7 @@ class Adaptation:
         left_out = f"{self.task} without {len(self.fault_set)} cells"
         return "\n".join([left_out, *(f"  {stage}" for stage in self.stages)])
 
-    def predict(self, x: NDArray[Any] | Tensor, /, **extra: NDArray[Any] | Tensor) -> NDArray[Any]:
+    def predict(self, x: NDArray[Any] | Tensor, **extra: NDArray[Any] | Tensor) -> NDArray[Any]:
         """Return the class of each window ``[N, T, D]``, int64 ``[N]``, or its values, float32
         ``[N, k]``; of a policy its actions, float32 ``[N, ...]``.
 
@@ -108,7 +108,7 @@ class Adaptation:
         return values
 
     def predict_proba(
-        self, x: NDArray[Any] | Tensor, /, **extra: NDArray[Any] | Tensor
+        self, x: NDArray[Any] | Tensor, **extra: NDArray[Any] | Tensor
     ) -> NDArray[np.float32]:
         """Return class probabilities ``[N, n_classes]`` of windows ``[N, T, D]``; arguments as
         :meth:`predict`.
@@ -180,7 +180,12 @@ class Adaptation:
         return class_recalls(windows.y, predicted, windows.recording, new=np.inf)
 
     def prediction_sets(
-        self, x: NDArray[Any] | Tensor, alpha: float = 0.1, *, by_class: bool = False
+        self,
+        x: NDArray[Any] | Tensor,
+        alpha: float = 0.1,
+        *,
+        by_class: bool = False,
+        **extra: NDArray[Any] | Tensor,
     ) -> NDArray[np.bool_]:
         """Return for each window the set of classes that holds its true one with probability
         1 - ``alpha``, bool ``[N, n_classes]``.
@@ -194,12 +199,13 @@ class Adaptation:
             alpha: the share of windows whose true class may be missing, between 0 and 1.
             by_class: the share holds for the windows of each class, and not only of all. Needs
                 1 / alpha - 1 validation recordings of a class, which else is in every set.
+            extra: as for :meth:`predict`.
 
         Raises:
             ValueError: ``alpha`` is outside; a regression; or the adaptation was stored without
                 validation.
         """
-        return self.conformal.sets(self.predict_proba(x), alpha, by_class)
+        return self.conformal.sets(self.predict_proba(x, **extra), alpha, by_class)
 
     @cached_property
     def conformal(self) -> PredictionSets:

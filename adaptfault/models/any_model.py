@@ -78,6 +78,7 @@ class AnyModel(WindowModel):
         *,
         extra: Mapping[str, Tensor] = MappingProxyType({}),
         touch: str | None = None,
+        actions: bool = False,
     ) -> AnyModel:
         """Run a module on windows ``x [N, T, D]`` and wrap it.
 
@@ -90,6 +91,7 @@ class AnyModel(WindowModel):
                 ``[N, p]``. None: the input of the last linear layer, if there is one.
             extra: what else it sees for these windows, ``[N, ...]`` each.
             touch: as for the class.
+            actions: the outputs may have any shape ``[N, ...]``.
 
         Raises:
             ValueError: the forward pass fails, its output is not ``[N, n]`` or ``[N, ...]``, a
@@ -120,10 +122,13 @@ class AnyModel(WindowModel):
         finally:
             for hook in hooks:
                 hook.remove()
-        if not isinstance(outputs, Tensor) or outputs.dim() < 2 or len(outputs) != len(x):
+        fits = isinstance(outputs, Tensor) and len(outputs) == len(x)
+        if not fits or outputs.dim() < 2 or (outputs.dim() > 2 and not actions):
             given = list(outputs.shape) if isinstance(outputs, Tensor) else type(outputs).__name__
+            expected = "..." if actions else "n"
             raise ValueError(
-                f"{name} returns {given} for windows of shape {shape}: expected [{len(x)}, n]"
+                f"{name} returns {given} for windows of shape {shape}: expected"
+                f" [{len(x)}, {expected}]"
             )
         if not torch.isfinite(outputs).all():
             raise ValueError(

@@ -15,6 +15,7 @@ import adaptfault as af
 from adaptfault.adaptation.adapter import Adapter
 from adaptfault.adaptation.result import Adaptation
 from adaptfault.data.windows import Windows, make_windows, split
+from adaptfault.models import builders
 from diagnostics import FaultSet, SensorLayout
 
 LAYOUT = SensorLayout(2, 3, 4)
@@ -232,6 +233,26 @@ def test_a_repaired_policy_is_stored(adapter, test_episodes, tmp_path):
         again.predict(test_episodes.x, **test_episodes.extra),
         adapted.predict(test_episodes.x, **test_episodes.extra),
     )
+
+
+def build(layout: SensorLayout, n_classes: int, length: int) -> nn.Module:
+    return Chunks()
+
+
+def test_an_adapter_of_a_policy_comes_back_from_a_folder(
+    policy, test_episodes, tmp_path, monkeypatch
+):
+    name = f"{__name__}:build"
+    monkeypatch.setattr(builders, "_allowed", {name})
+    built = builders.build_model(name, LAYOUT, 10, length=4)
+    built.load_state_dict(policy.state_dict())
+    adapter = Adapter(built, observed(40), observed(10, first=100), layout=LAYOUT)
+    af.save_adapter(tmp_path / "adapter", adapter)
+    again = af.load_adapter(tmp_path / "adapter")
+    expected = adapter.adapt(F, method="fill").predict(test_episodes.x, **test_episodes.extra)
+    actions = again.adapt(F, method="fill").predict(test_episodes.x, **test_episodes.extra)
+    # readings are stored with 12 bits
+    np.testing.assert_allclose(actions, expected, atol=0.02)
 
 
 def test_windows_are_cut_from_all_inputs_alike_and_split_by_episode():

@@ -41,6 +41,7 @@ class FaultFreeModel:
         model: the network; other modules are wrapped in
             :class:`~adaptfault.models.any_model.AnyModel`.
         task: "classification" or "regression".
+        acts: it is a policy: it sees more than touch, or returns actions of several axes.
         targets, validation_targets: ``[N, n]``, class indicators or probabilities; values of a
             regression.
     """
@@ -67,6 +68,7 @@ class FaultFreeModel:
         train = train.independent
         validation = validation.independent
         self.task = _task(task, train, validation)
+        self.acts = _acts(train)
         self.model = _wrapped(model, train, layout, features, touch)
         _check_targets(self.model, self.task, train, validation)
         self.loss = loss
@@ -199,6 +201,11 @@ def _wrapped(
     )
 
 
+def _acts(windows: Windows) -> bool:
+    """Return whether these are windows of a policy."""
+    return bool(windows.extra) or windows.y.ndim > 2
+
+
 def _check_windows(train: Windows, validation: Windows) -> None:
     if train.x.shape[1:] != validation.x.shape[1:]:
         shapes = f"{list(train.x.shape[1:])}, validation windows {list(validation.x.shape[1:])}"
@@ -221,7 +228,7 @@ def _check_windows(train: Windows, validation: Windows) -> None:
             f" {sorted(validation.extra)}: give both the same"
         )
     shared = np.intersect1d(train.recording, validation.recording)
-    if len(shared) and (train.extra or train.y.ndim > 2):
+    if len(shared) and _acts(train):
         raise ValueError(
             f"episode {shared[0]} is in training and in validation: split by episode, as"
             " adaptfault.split does, and give every episode its own number"

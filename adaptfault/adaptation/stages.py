@@ -131,7 +131,8 @@ class Run:
         """Train all parameters, front end included, in rounds that each end with a new head.
 
         It stops when rounds no longer improve validation. A larger budget allows more of the same
-        rounds, so its result is never worse.
+        rounds, so its result is never worse. A policy keeps its own last layer instead, because a
+        head would take its time again at each round and at each step of the robot.
         """
         network = copy.deepcopy(self.fault_free.model)
         reduced = self._behind(self.fault_free.imputation.linear(self.fault_set), network)
@@ -215,7 +216,7 @@ class Run:
         before = self._quality(self.held_out())
         start = time.perf_counter()
         began = start if began is None else began
-        fitted = self._head(reduced)
+        fitted = self._head(reduced, own=name == "finetune" and self.fault_free.acts)
         if fitted is None:
             return False
         head, logits = fitted
@@ -258,13 +259,13 @@ class Run:
             return shares
         return log_likelihood(outputs, self.validation.y)
 
-    def _head(self, reduced: ReducedModel) -> tuple[Head | None, Tensor] | None:
+    def _head(self, reduced: ReducedModel, own: bool = False) -> tuple[Head | None, Tensor] | None:
         """Return a head, and the outputs for validation windows of heads fitted without them; None
         if time is short.
 
-        A model without features keeps its own head.
+        A model without features, or told to, keeps its ``own`` head.
         """
-        if not self.fault_free.has_features:
+        if own or not self.fault_free.has_features:
             return None, logits_of(reduced, self.validation.x, self.validation.extra)
         if self._too_long(reduced, len(self.training) + len(self.validation)):
             return None

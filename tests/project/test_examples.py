@@ -49,6 +49,8 @@ LESS = {  # they take minutes
     "iclabel.py": ["--components", "5"],
     "mujoco_bench.py": ["--small"],
     "mujoco_gripper.py": ["--grasps", "1"],
+    "mujoco_lift.py": ["--episodes", "2"],
+    "mujoco_policy.py": ["--quick"],
 }
 SLOW = {  # they take long, or a test of the library proves the same
     "any_model.py",
@@ -73,6 +75,8 @@ SLOW = {  # they take long, or a test of the library proves the same
     "monitor_cost.py",
     "mujoco_bench.py",
     "mujoco_gripper.py",
+    "mujoco_lift.py",
+    "mujoco_policy.py",
     "own_model.py",
     "picture.py",
     "power_cut.py",
@@ -102,6 +106,8 @@ NEEDS = {
     "iclabel.py": "mne_icalabel",
     "mujoco_bench.py": "mujoco",
     "mujoco_gripper.py": "mujoco",
+    "mujoco_lift.py": "mujoco",
+    "mujoco_policy.py": "mujoco",
     "ros_latency.py": "rclpy",
 }
 

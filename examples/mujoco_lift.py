@@ -1,7 +1,7 @@
 """A task that needs touch, in MuJoCo: python examples/mujoco_lift.py [--episodes 50]
 
 The gripper of ``mujoco_gripper.py`` has to lift an object with just enough force. A fragile ball
-breaks above 7 N; a heavy rod slips below 12 N and breaks above 30 N. The fingers are sent to a
+breaks above 10 N; a heavy rod slips below 12 N and breaks above 30 N. The fingers are sent to a
 position and do not say where they are. How wide the object is, where it lies and which of the two
 it is has to be felt. A step takes 50 ms, and a policy gives for each step
 
@@ -37,7 +37,7 @@ CARRIED = 8  # steps that the object hangs in the gripper
 SLIP = 4 * MILLIMETRE
 FRAMES = 3  # of touch that a policy sees
 HORIZON = 4  # steps of an action chunk
-REPLAN = 2  # steps of a chunk that are carried out
+REPLAN = 1  # steps of a chunk that are carried out
 NOISE = 0.004  # of a reading, as a share of full scale
 STEPS = 4095  # of the converter
 DISTURBED = 0.25  # standard deviation of what is added to how far the fingers close
@@ -67,7 +67,7 @@ class Kind:
         return float(np.sqrt(self.firm * self.crushed))
 
 
-BALL = Kind("sphere", (9, 14), 2.0, 2.0, 7.0)
+BALL = Kind("sphere", (9, 14), 2.0, 2.0, 10.0)
 ROD = Kind("cylinder", (5, 9), 14.0, 12.0, 30.0)
 KINDS = (BALL, ROD)
 

@@ -112,7 +112,7 @@ class AnyModel(WindowModel):
         ]
         try:
             with evaluating(module):
-                outputs = wrapped.call(x, others)
+                outputs: Any = wrapped.call(x, others)
         except Exception as error:  # a model may raise anything
             raise ValueError(
                 f"{name} fails on windows of shape {shape}{_and(others)}: {first_line(error)}; an"

@@ -306,7 +306,7 @@ def batches(
 
 def tensors_of(extra: Mapping[str, Batch]) -> dict[str, Tensor]:
     """Return what a model sees beside touch as tensors; numbers that are not whole as float32."""
-    found = {}
+    found: dict[str, Tensor] = {}
     for name, values in extra.items():
         of = values if isinstance(values, Tensor) else as_tensor(plain_array(values))
         found[name] = of.float() if of.is_floating_point() else of

@@ -48,6 +48,7 @@ LESS = {  # they take minutes
     "fleet_scaling.py": ["--robots", "4", "--batch", "2", "--adapted", "1"],
     "iclabel.py": ["--components", "5"],
     "mujoco_bench.py": ["--small"],
+    "lerobot_policy.py": ["--quick"],
     "mujoco_gripper.py": ["--grasps", "1"],
     "mujoco_lift.py": ["--episodes", "2"],
     "mujoco_policy.py": ["--quick"],
@@ -70,6 +71,7 @@ SLOW = {  # they take long, or a test of the library proves the same
     "iclabel.py",
     "io_errors.py",
     "kill_maintenance.py",
+    "lerobot_policy.py",
     "lerobot_set.py",
     "monitor_alarms.py",
     "monitor_cost.py",
@@ -104,6 +106,7 @@ SLOW_ON_RECORDINGS = {
 NEEDS = {
     "deploy_speed.py": "onnxruntime",
     "iclabel.py": "mne_icalabel",
+    "lerobot_policy.py": "lerobot",
     "mujoco_bench.py": "mujoco",
     "mujoco_gripper.py": "mujoco",
     "mujoco_lift.py": "mujoco",

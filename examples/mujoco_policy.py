@@ -11,7 +11,8 @@ that floats. For each, the table has the share of episodes in which the object i
 lifted: with nothing done; filled, with a new head, and fine-tuned by :class:`adaptfault.Adapter`;
 trained anew on the healthy cells as the first time; and of the policy with mask tokens, with
 nothing done and with F masked. All see the same objects. Intervals are Wilson's, of 95 %. Touch
-that reads 0 everywhere shows whether the task needs it.
+that reads 0 everywhere shows whether the task needs it. A head may be better than what the policy
+ends with; without a fault it shows how much of a gain is no repair.
 
 ``OUT/results.csv`` gets a line for each row as it is found; ``OUT/results.md`` is the table.
 """
@@ -106,6 +107,9 @@ class Damage:
     def cells(self) -> FaultSet:
         """F."""
         return FaultSet(tuple(sorted(c for fault in self.faults for c in fault.cells)), D)
+
+
+HEALTHY = Damage("none", ())
 
 
 def damages(seed: int) -> list[Damage]:
@@ -230,7 +234,6 @@ class Row:
 
 ENDS = ("lifted", "dropped", "crushed", "not lifted")
 HEADS = ("damage", "policy", "success", "low", "high", *ENDS, "seconds of the repair")
-MASKS = "mask tokens, nothing done"
 REPAIRS: tuple[Method, ...] = ("fill", "head", "finetune")
 
 
@@ -256,16 +259,16 @@ class Study:
     def rows(self) -> Iterator[Row]:
         """Yield the lines of the table, the quickest first."""
         every = FaultSet(tuple(range(D)), D)
-        yield self.tried("none", "nothing done", acting(self.plain))
-        yield self.tried("none", "touch reads 0", acting(self.plain, set_to(every, 0.0)))
-        for damage in damages(self.seed):
-            yield self.tried(damage.name, "nothing done", acting(self.plain), damage)
+        yield self.tried(HEALTHY, "touch reads 0", acting(self.plain, set_to(every, 0.0)))
+        for damage in (HEALTHY, *damages(self.seed)):
+            yield self.tried(damage, "nothing done", acting(self.plain))
         adapter = af.Adapter(
             self.plain, self.training, self.validation, layout=LAYOUT, loss=nn.functional.l1_loss
         )
         for method in REPAIRS:
             for damage in damages(self.seed):
                 yield self.repaired(adapter, damage, method)
+        yield self.repaired(adapter, HEALTHY, "head")
         yield from self.of_masks()
         for damage in damages(self.seed):
             yield self.anew(damage)
@@ -274,11 +277,11 @@ class Study:
         """Yield the lines of the policy with mask tokens."""
         longer = 3 * self.epochs // 2
         masked = learn(self.training, self.validation, longer, self.seed, masks=True)
-        yield self.tried("none", MASKS, acting(masked))
+        for damage in (HEALTHY, *damages(self.seed)):
+            yield self.tried(damage, "mask tokens, nothing done", acting(masked))
         for damage in damages(self.seed):
-            yield self.tried(damage.name, MASKS, acting(masked), damage)
             put = set_to(damage.cells, np.nan)
-            yield self.tried(damage.name, "mask tokens, F masked", acting(masked, put), damage)
+            yield self.tried(damage, "mask tokens, F masked", acting(masked, put))
 
     def repaired(self, adapter: af.Adapter, damage: Damage, method: Method) -> Row:
         """Return the line of a repair."""
@@ -290,7 +293,7 @@ class Study:
         def act(touch: Floats, state: Floats) -> Floats:
             return adapted.predict(touch, state=state)
 
-        return self.tried(damage.name, method, act, damage, took)
+        return self.tried(damage, method, act, took)
 
     def anew(self, damage: Damage) -> Row:
         """Return the line of a policy that was trained on the healthy cells, as the first time."""
@@ -300,19 +303,12 @@ class Study:
         policy = learn(training, validation, self.epochs, self.seed + 1)
         took = time.perf_counter() - began
         blind = set_to(damage.cells, 0.0)
-        return self.tried(damage.name, "trained anew", acting(policy, blind), damage, took)
+        return self.tried(damage, "trained anew", acting(policy, blind), took)
 
-    def tried(
-        self,
-        name: str,
-        what: str,
-        policy: Policy,
-        damage: Damage | None = None,
-        seconds: float = 0.0,
-    ) -> Row:
+    def tried(self, damage: Damage, what: str, policy: Policy, seconds: float = 0.0) -> Row:
         """Return the line of a policy under a damage."""
-        faults = () if damage is None else damage.faults
-        return Row(name, what, seconds, tuple(rollouts(policy, self.seeds, faults)))
+        outcomes = rollouts(policy, self.seeds, damage.faults)
+        return Row(damage.name, what, seconds, tuple(outcomes))
 
 
 def prepared(count: int, epochs: int, episodes: int, seed: int) -> Study:

@@ -68,12 +68,12 @@ class Adapter(FaultFreeModel):
             method: "fill": the missing cells are imputed from the healthy ones, no training.
                 "head": in addition, a new head is fitted in closed form to the features of the
                 network and the healthy cells. "finetune": in addition, all parameters are trained,
-                front end included, in rounds that each end with a new head. "scratch": a new
-                network is trained on the healthy cells, the paper's protocol. "auto": fill; head,
-                unless validation loses beyond the noise by it; finetune, if a budget is given and
-                the head keeps less than 99 % of the healthy accuracy. With F empty, "fill" is the
-                fault-free model, bit for bit, and "auto" is :attr:`healthy`, that model with as
-                good a head as a repair gets.
+                front end included, in rounds that each end with a new head; of a policy, after the
+                fill and with its own last layer. "scratch": a new network is trained on the healthy
+                cells, the paper's protocol. "auto": fill; head, unless validation loses beyond the
+                noise by it; finetune, if a budget is given and the head keeps less than 99 % of the
+                healthy accuracy. With F empty, "fill" is the fault-free model, bit for bit, and
+                "auto" is :attr:`healthy`, that model with as good a head as a repair gets.
             budget: seconds for the stages after the fill; a stage that does not fit is left out.
                 None: until validation stops improving.
             seed: of training.

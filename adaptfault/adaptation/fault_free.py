@@ -161,9 +161,7 @@ class _OfActions:
 
     def __call__(self, outputs: Tensor, y: Tensor) -> Tensor:
         """Return the loss of outputs ``[B, k]`` and targets ``[B, k]``."""
-        return self.loss(
-            torch.unflatten(outputs, 1, self.shape), torch.unflatten(y, 1, self.shape)
-        )
+        return self.loss(torch.unflatten(outputs, 1, self.shape), torch.unflatten(y, 1, self.shape))
 
 
 def _wrapped(

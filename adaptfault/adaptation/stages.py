@@ -106,7 +106,8 @@ class Run:
             case "head":
                 self.head()
             case "finetune":
-                self.head()
+                if not (self.fault_free.acts and len(self.fault_set)):
+                    self.head()
                 if len(self.fault_set):
                     self.finetune()
             case "auto":
@@ -131,8 +132,8 @@ class Run:
         """Train all parameters, front end included, in rounds that each end with a new head.
 
         It stops when rounds no longer improve validation. A larger budget allows more of the same
-        rounds, so its result is never worse. A policy keeps its own last layer instead, because a
-        head would take its time again at each round and at each step of the robot.
+        rounds, so its result is never worse. A policy keeps its own last layer instead, and starts
+        from the fill: a head takes its time at each round, and again at each step of the robot.
         """
         network = copy.deepcopy(self.fault_free.model)
         reduced = self._behind(self.fault_free.imputation.linear(self.fault_set), network)

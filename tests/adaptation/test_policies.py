@@ -14,9 +14,10 @@ from torch import Tensor, nn
 import adaptfault as af
 from adaptfault.adaptation.adapter import Adapter
 from adaptfault.adaptation.result import Adaptation
+from adaptfault.bundle.bundle import Bundle
 from adaptfault.data.windows import Windows, make_windows, split
 from adaptfault.models import builders
-from diagnostics import FaultSet, SensorLayout
+from diagnostics import FaultSet, SelfDiagnosis, SensorLayout
 
 LAYOUT = SensorLayout(2, 3, 4)
 D = LAYOUT.n_cells
@@ -303,6 +304,8 @@ def test_bad_input_is_told_in_one_line(policy, adapter):
     assert "validation windows []" in refused(policy, training, lacking)
     holes = {"joints": np.full((24, 3), np.nan)}
     assert "input 'joints'" in refused(policy, training, replace(validation, extra=holes))
+    with pytest.raises(ValueError, match=r"^a bundle holds a classifier.*touch alone: store"):
+        Bundle.create("nowhere.bundle", adapter.model, adapter, SelfDiagnosis(LAYOUT))
     with pytest.raises(ValueError, match=r"^F is over 23 cells, .*24"):
         adapter.adapt(FaultSet((1,), 23))
 

@@ -136,7 +136,10 @@ class Run:
         from the fill: a head takes its time at each round, and again at each step of the robot.
         """
         network = copy.deepcopy(self.fault_free.model)
-        reduced = self._behind(self.fault_free.imputation.linear(self.fault_set), network)
+        front: nn.Module | None = self.fault_free.imputation.linear(self.fault_set)
+        if self.fault_free.acts:
+            front = copy.deepcopy(self.reduced.front)
+        reduced = self._behind(front, network)
         if self.fault_free.task == "classification" and network.head is not None:
             features = self._views(reduced, self.training).features.cpu().double().numpy()
             weight, bias = linear_head(features, self.training.y, network.n_classes)

@@ -12,8 +12,8 @@ lifted: with nothing done; filled, with a new head, and fine-tuned by :class:`ad
 trained anew on the healthy cells as the first time; and of the policy with mask tokens, with
 nothing done and with F masked. All see the same objects. Intervals are Wilson's, of 95 %. Touch
 that reads 0 everywhere shows whether the task needs it. A head may be better than what the policy
-ends with; without a fault it shows how much of a gain is no repair. Training anew has other initial weights,
-and without a fault shows how much they matter.
+ends with; without a fault it shows how much of a gain is no repair. Training anew has other initial
+weights, and without a fault shows how much they matter.
 
 ``OUT/results.csv`` gets a line for each row as it is found; ``OUT/results.md`` is the table.
 """

@@ -27,22 +27,28 @@ class Adapter(FaultFreeModel):
 
     Args:
         model: the fault-free model, any module from x ``[N, T, D]`` (0..1 scale) to logits or
-            values ``[N, n]``. It never changes. Computation is on the CPU, unless :meth:`to` moves
-            it.
+            values ``[N, n]``, or a policy from touch x and other inputs to actions of any shape, as
+            chunks ``[N, H, A]``. It never changes. Computation is on the CPU, unless :meth:`to`
+            moves it.
         train, validation: fault-free windows; more than 2500 validation windows are thinned evenly.
         A regression has
-            targets y float ``[N, k]``.
+            targets y float ``[N, k]``, a policy actions of the shape that it returns. What else a
+            policy sees is their :attr:`~adaptfault.Windows.extra`, which no repair changes; their
+            recordings are its episodes, of which none is in both.
         layout: the array; None: ``model.layout``.
         features: feature vector for a new head: the name of a layer (its output), or a function of
             (module, x) that returns ``[N, p]``. None: the input of the last linear layer.
         task: "classification", "regression" or "auto" (from the shape of y).
         loss: of training, (outputs ``[B, n]``, y) -> scalar. None: cross entropy, or mean squared
             error.
+        touch: the model takes one dict of inputs, as a policy of LeRobot does, with touch under
+            this name. None: it takes touch first, and other inputs by name.
 
     Raises:
         TypeError: ``model`` is no torch module.
         ValueError: no windows or no layout; the model fails on a window, its output does not fit
-            the targets, or the named features cannot be found.
+            the targets, or the named features cannot be found; a policy that does not use touch, or
+            an episode in both sets of windows.
     """
 
     def adapt(
@@ -62,12 +68,12 @@ class Adapter(FaultFreeModel):
             method: "fill": the missing cells are imputed from the healthy ones, no training.
                 "head": in addition, a new head is fitted in closed form to the features of the
                 network and the healthy cells. "finetune": in addition, all parameters are trained,
-                front end included, in rounds that each end with a new head. "scratch": a new
-                network is trained on the healthy cells, the paper's protocol. "auto": fill; head,
-                unless validation loses beyond the noise by it; finetune, if a budget is given and
-                the head keeps less than 99 % of the healthy accuracy. With F empty, "fill" is the
-                fault-free model, bit for bit, and "auto" is :attr:`healthy`, that model with as
-                good a head as a repair gets.
+                front end included, in rounds that each end with a new head; of a policy, after the
+                fill and with its own last layer. "scratch": a new network is trained on the healthy
+                cells, the paper's protocol. "auto": fill; head, unless validation loses beyond the
+                noise by it; finetune, if a budget is given and the head keeps less than 99 % of the
+                healthy accuracy. With F empty, "fill" is the fault-free model, bit for bit, and
+                "auto" is :attr:`healthy`, that model with as good a head as a repair gets.
             budget: seconds for the stages after the fill; a stage that does not fit is left out.
                 None: until validation stops improving.
             seed: of training.

@@ -4,6 +4,7 @@ pickle."""
 from __future__ import annotations
 
 import zlib
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from adaptfault.adaptation.adapter import Adapter
 from adaptfault.data.windows import Windows, evenly
 from adaptfault.imputation.statistics import CellStatistics
 from adaptfault.models.any_model import network_from_config
+from adaptfault.models.network import tensors_of
 from adaptfault.models.store import Place, check_rebuildable, load_tensors, save_tensors, undamaged
 
 SCHEMA = "adaptfault.adapter/1"
@@ -25,6 +27,7 @@ _SHARE = 0.5  # of the limit: the most that windows take
 _FINEST = 1 / 4095  # step for readings without visible converter steps: a 12-bit converter
 _MOST_STEPS = 65_535
 _COARSEST = 1e-3  # largest error of a 16-bit float, in units of the largest of its tensor
+_EXTRA = "extra."  # before the name of what a policy sees beside touch
 _OVERHEAD = 100_000  # bytes for names, labels and JSON
 
 
@@ -115,7 +118,10 @@ def load_adapter(path: Place) -> Adapter:
             _restore({k.removeprefix("model."): v for k, v in tensors.items() if k[:6] == "model."})
         )
         task = about.get("task", "classification")
-        parts = (_unpack(about[name], tensors, name) for name in ("train", "validation"))
+        parts = [_unpack(about[name], tensors, name) for name in ("train", "validation")]
+        if task == "regression":  # actions are stored as values
+            shape = getattr(model, "shape", (model.n_classes,))
+            parts = [replace(part, y=part.y.reshape(-1, *shape)) for part in parts]
         adapter = Adapter(model.eval(), *parts, task=task)
         if task == "classification":
             adapter.targets, adapter.validation_targets = (
@@ -179,6 +185,7 @@ def _pack(
         "y": torch.from_numpy(windows.y),
         "recording": torch.from_numpy(windows.recording),
     }
+    packed |= {f"{_EXTRA}{name}": of for name, of in tensors_of(windows.extra).items()}
     if targets is not None:
         packed["targets"] = torch.from_numpy(targets).half()
     return packed, {"shape": list(windows.x.shape), "low": low, "step": step}
@@ -192,7 +199,14 @@ def _unpack(packing: dict[str, Any], tensors: dict[str, Tensor], name: str) -> W
     counts = np.frombuffer(data, np.uint8).reshape(2, -1).T.copy().view(np.uint16).reshape(n, t, d)
     counts = np.cumsum(counts, axis=1, dtype=np.uint16)
     x = (packing["low"] + counts * packing["step"]).astype(np.float32)
-    return Windows(x, tensors[f"{name}.y"].numpy(), tensors[f"{name}.recording"].numpy())
+    others = f"{name}.{_EXTRA}"
+    extra = {
+        key.removeprefix(others): of.numpy()
+        for key, of in tensors.items()
+        if key.startswith(others)
+    }
+    y = tensors[f"{name}.y"].numpy()
+    return Windows(x, y, tensors[f"{name}.recording"].numpy(), extra)
 
 
 def _steps(x: NDArray[np.float32]) -> tuple[float, float]:

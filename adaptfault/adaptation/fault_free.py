@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Literal, get_args
 
@@ -21,7 +21,7 @@ from adaptfault.models.any_model import AnyModel, Features, device_of
 from adaptfault.models.builders import first_line
 from adaptfault.models.compact import CompactNetwork, compacted
 from adaptfault.models.heads import MOST_WINDOWS
-from adaptfault.models.network import TactileTransformer, as_tensor, logits_of
+from adaptfault.models.network import TactileTransformer, as_tensor, logits_of, tensors_of
 from diagnostics import SensorLayout
 
 Task = Literal["classification", "regression"]
@@ -34,13 +34,14 @@ class FaultFreeModel:
     """A model, fault-free windows, and the statistics that all adaptations share.
 
     Args:
-        model, train, validation, layout, features, task, loss: as in
+        model, train, validation, layout, features, task, loss, touch: as in
             :class:`~adaptfault.adaptation.adapter.Adapter`.
 
     Attributes:
         model: the network; other modules are wrapped in
             :class:`~adaptfault.models.any_model.AnyModel`.
         task: "classification" or "regression".
+        acts: it is a policy: it sees more than touch, or returns actions of several axes.
         targets, validation_targets: ``[N, n]``, class indicators or probabilities; values of a
             regression.
     """
@@ -55,6 +56,7 @@ class FaultFreeModel:
         features: Features | None = None,
         task: Task | Literal["auto"] = "auto",
         loss: Callable[[Tensor, Tensor], Tensor] | None = None,
+        touch: str | None = None,
     ) -> None:
         if not len(train) or not len(validation):
             raise ValueError(
@@ -66,15 +68,20 @@ class FaultFreeModel:
         train = train.independent
         validation = validation.independent
         self.task = _task(task, train, validation)
-        self.loss = loss
-        self.model = _wrapped(model, train, layout, features)
+        self.acts = _acts(train)
+        self.model = _wrapped(model, train, layout, features, touch)
         _check_targets(self.model, self.task, train, validation)
+        self.loss = loss
+        if loss is not None and train.y.ndim > 2:
+            self.loss = _OfActions(loss, train.y.shape[1:])
+        train = train.flat
+        validation = validation.flat
         most = MOST_WINDOWS // 2  # enough to compare accuracies
         validation = validation.select(evenly(len(validation), most))
         self.train, self.targets = _labelled(self.model, self.task, train)
         self.validation, self.validation_targets = _labelled(self.model, self.task, validation)
-        if loss is not None:
-            _check_loss(self.model, loss, self.train)
+        if self.loss is not None:
+            _check_loss(self.model, self.loss, self.train)
 
     @property
     def layout(self) -> SensorLayout:
@@ -140,8 +147,29 @@ class FaultFreeModel:
         return fresh
 
 
+@dataclass(frozen=True)
+class _OfActions:
+    """A loss of actions ``[B, ...]`` that takes them as values ``[B, k]``.
+
+    Attributes:
+        loss: of actions of this shape.
+        shape: of the actions of one window.
+    """
+
+    loss: Callable[[Tensor, Tensor], Tensor]
+    shape: tuple[int, ...]
+
+    def __call__(self, outputs: Tensor, y: Tensor) -> Tensor:
+        """Return the loss of outputs ``[B, k]`` and targets ``[B, k]``."""
+        return self.loss(torch.unflatten(outputs, 1, self.shape), torch.unflatten(y, 1, self.shape))
+
+
 def _wrapped(
-    model: nn.Module, train: Windows, layout: SensorLayout | None, features: Features | None
+    model: nn.Module,
+    train: Windows,
+    layout: SensorLayout | None,
+    features: Features | None,
+    touch: str | None,
 ) -> Network:
     if not isinstance(model, nn.Module):
         raise TypeError(
@@ -161,7 +189,21 @@ def _wrapped(
         model = copy.deepcopy(model).cpu()
     if isinstance(model, AnyModel) or (isinstance(model, TactileTransformer) and features is None):
         return model
-    return AnyModel.probe(model, layout, as_tensor(train.x[:8]), features)
+    few = train.select(slice(0, 8))
+    return AnyModel.probe(
+        model,
+        layout,
+        as_tensor(few.x),
+        features,
+        extra=tensors_of(few.extra),
+        touch=touch,
+        actions=few.y.ndim > 2,
+    )
+
+
+def _acts(windows: Windows) -> bool:
+    """Return whether these are windows of a policy."""
+    return bool(windows.extra) or windows.y.ndim > 2
 
 
 def _check_windows(train: Windows, validation: Windows) -> None:
@@ -174,12 +216,29 @@ def _check_windows(train: Windows, validation: Windows) -> None:
                 f"{name} windows hold NaN or infinity: make_windows holds the last reading of a"
                 " cell"
             )
+        for key, values in windows.extra.items():
+            if values.dtype.kind == "f" and not np.isfinite(values).all():
+                raise ValueError(
+                    f"the input {key!r} of {name} windows holds NaN or infinity: leave these"
+                    " windows out"
+                )
+    if set(train.extra) != set(validation.extra):
+        raise ValueError(
+            f"training windows have the inputs {sorted(train.extra)}, validation windows"
+            f" {sorted(validation.extra)}: give both the same"
+        )
+    shared = np.intersect1d(train.recording, validation.recording)
+    if len(shared) and _acts(train):
+        raise ValueError(
+            f"episode {shared[0]} is in training and in validation: split by episode, as"
+            " adaptfault.split does, and give every episode its own number"
+        )
 
 
 def _check_loss(model: Network, loss: Callable[[Tensor, Tensor], Tensor], windows: Windows) -> None:
     # more windows than outputs: a wrong shape does not broadcast
     few = windows.select(slice(0, model.n_classes + 1))
-    outputs = logits_of(model, few.x)
+    outputs = logits_of(model, few.x, few.extra)
     y = as_tensor(few.y)
     given = f"outputs {list(outputs.shape)} and y {list(y.shape)}"
     try:
@@ -200,7 +259,7 @@ def _task(task: str, train: Windows, validation: Windows) -> Task:
         raise ValueError(
             "training and validation windows have different targets: classes [N] and values [N, k]"
         )
-    found: Task = "regression" if train.y.ndim == 2 else "classification"
+    found: Task = "regression" if train.y.ndim >= 2 else "classification"
     if task not in ("auto", found):
         raise ValueError(
             f"task {task!r} needs {'y float [N, k]' if found == 'classification' else 'y int [N]'}"
@@ -210,8 +269,14 @@ def _task(task: str, train: Windows, validation: Windows) -> Task:
 
 def _check_targets(model: Network, task: Task, *parts: Windows) -> None:
     name = type(model.module if isinstance(model, AnyModel) else model).__name__
+    shape = getattr(model, "shape", (model.n_classes,))
     for windows in parts:
-        if task == "regression" and windows.y.shape[1] != model.n_classes:
+        if max(len(shape) + 1, windows.y.ndim) > 2 and windows.y.shape[1:] != shape:
+            raise ValueError(
+                f"{name} returns actions [N, {', '.join(map(str, shape))}], the targets are"
+                f" {list(windows.y.shape)}: give what it should return for each window"
+            )
+        if task == "regression" and windows.y.shape[1:] != shape:
             k = windows.y.shape[1]
             raise ValueError(
                 f"{name} has {model.n_classes} outputs, the targets {k} values: give a model"
@@ -235,6 +300,7 @@ def _labelled(model: Network, task: Task, windows: Windows) -> tuple[Windows, ND
     targets = np.eye(model.n_classes, dtype=np.float32)[np.maximum(windows.y, 0)]
     unknown = windows.y < 0
     if unknown.any():
-        targets[unknown] = logits_of(model, windows.x[unknown]).softmax(1).numpy()
+        open_ones = windows.select(unknown)
+        targets[unknown] = logits_of(model, open_ones.x, open_ones.extra).softmax(1).numpy()
     y: NDArray[Any] = np.where(unknown, targets.argmax(1), windows.y)
     return replace(windows, y=y), targets

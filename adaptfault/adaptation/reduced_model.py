@@ -8,6 +8,7 @@ missing ones.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -75,8 +76,9 @@ class ReducedModel(nn.Module):
             )
         return x if self.front is None else self.front(x)
 
-    def views(self, x: Tensor) -> Views:
-        """Map windows of the healthy cells ``[N, T, D-k]`` to the input of a head.
+    def views(self, x: Tensor, /, **extra: Tensor) -> Views:
+        """Map windows of the healthy cells ``[N, T, D-k]``, and what else the network sees, to the
+        input of a head.
 
         They are the features of the network, the
         :class:`~adaptfault.adaptation.contact_moments.ContactMoments` of the whole windows, and the
@@ -87,14 +89,16 @@ class ReducedModel(nn.Module):
         whole = self.complete(x)
         smooth, course = self.summary(loads(x, rest[self.healthy]))
         moments = self.moments(loads(whole, rest))
-        return Views(self.network.features(whole), smooth, moments, course)
+        return Views(self.network.features(whole, **extra), smooth, moments, course)
 
-    def forward(self, x: Tensor) -> Tensor:
-        """Map windows of the healthy cells ``[N, T, D-k]``, scaled to 0..1, to logits
-        ``[N, n_classes]``."""
-        logits: Tensor = (
-            self.network(self.complete(x)) if self.head is None else self.head(self.views(x))
-        )
+    def forward(self, x: Tensor, /, **extra: Tensor) -> Tensor:
+        """Map windows of the healthy cells ``[N, T, D-k]``, scaled to 0..1, and what else the
+        network sees, to logits ``[N, n_classes]``."""
+        logits: Tensor
+        if self.head is None:
+            logits = self.network(self.complete(x), **extra)
+        else:
+            logits = self.head(self.views(x, **extra))
         return logits
 
 
@@ -119,4 +123,4 @@ def phi(x: NDArray[Any], fault_set: FaultSet) -> NDArray[Any]:
 
 def reduce_windows(windows: Windows, fault_set: FaultSet) -> Windows:
     """Apply :func:`phi` to windows."""
-    return Windows(phi(windows.x, fault_set), windows.y, windows.recording)
+    return replace(windows, x=phi(windows.x, fault_set))

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
+from types import MappingProxyType
 from typing import Any, Literal
 
 import numpy as np
@@ -86,33 +88,46 @@ class Adaptation:
         left_out = f"{self.task} without {len(self.fault_set)} cells"
         return "\n".join([left_out, *(f"  {stage}" for stage in self.stages)])
 
-    def predict(self, x: NDArray[Any] | Tensor) -> NDArray[Any]:
+    def predict(self, x: NDArray[Any] | Tensor, **extra: NDArray[Any] | Tensor) -> NDArray[Any]:
         """Return the class of each window ``[N, T, D]``, int64 ``[N]``, or its values, float32
-        ``[N, k]``.
+        ``[N, k]``; of a policy its actions, float32 ``[N, ...]``.
 
         The cells in F may hold anything, NaN included; a missing reading of another cell is held
         from the frame before.
-        """
-        outputs = self._logits(x)
-        answers: NDArray[Any] = (
-            outputs if self.task == "regression" else outputs.argmax(1)
-        ).numpy()
-        return answers
 
-    def predict_proba(self, x: NDArray[Any] | Tensor) -> NDArray[np.float32]:
-        """Return class probabilities ``[N, n_classes]`` of windows ``[N, T, D]``.
+        Args:
+            x: windows on the 0..1 scale.
+            extra: what else the model sees of these windows, by name, ``[N, ...]`` each.
+        """
+        outputs = self._logits(x, extra)
+        if self.task == "classification":
+            classes: NDArray[Any] = outputs.argmax(1).numpy()
+            return classes
+        shape = getattr(self.model.network, "shape", outputs.shape[1:])
+        values: NDArray[Any] = outputs.reshape(-1, *shape).numpy()
+        return values
+
+    def predict_proba(
+        self, x: NDArray[Any] | Tensor, **extra: NDArray[Any] | Tensor
+    ) -> NDArray[np.float32]:
+        """Return class probabilities ``[N, n_classes]`` of windows ``[N, T, D]``; arguments as
+        :meth:`predict`.
 
         Raises:
             ValueError: the model is a regression.
         """
         if self.task == "regression":
             raise ValueError("a regression has no class probabilities: use predict")
-        probabilities: NDArray[np.float32] = self._logits(x).softmax(1).numpy()
+        probabilities: NDArray[np.float32] = self._logits(x, extra).softmax(1).numpy()
         return probabilities
 
-    def _logits(self, x: NDArray[Any] | Tensor) -> Tensor:
+    def _logits(
+        self,
+        x: NDArray[Any] | Tensor,
+        extra: Mapping[str, NDArray[Any] | Tensor] = MappingProxyType({}),
+    ) -> Tensor:
         healthy = phi(plain_array(x).astype(np.float32, copy=False), self.fault_set)
-        return logits_of(self.model, finite_windows(healthy))
+        return logits_of(self.model, finite_windows(healthy), extra)
 
     @cached_property
     def scores(self) -> Scores | ValueScores:
@@ -130,7 +145,8 @@ class Adaptation:
     def _outputs(self, validation: Windows) -> Tensor:
         """Return the outputs for the validation windows, computed once."""
         if self._held_out is None:
-            object.__setattr__(self, "_held_out", self._logits(validation.x))
+            outputs = self._logits(validation.x, validation.extra)
+            object.__setattr__(self, "_held_out", outputs)
         assert self._held_out is not None
         return self._held_out
 
@@ -164,7 +180,12 @@ class Adaptation:
         return class_recalls(windows.y, predicted, windows.recording, new=np.inf)
 
     def prediction_sets(
-        self, x: NDArray[Any] | Tensor, alpha: float = 0.1, *, by_class: bool = False
+        self,
+        x: NDArray[Any] | Tensor,
+        alpha: float = 0.1,
+        *,
+        by_class: bool = False,
+        **extra: NDArray[Any] | Tensor,
     ) -> NDArray[np.bool_]:
         """Return for each window the set of classes that holds its true one with probability
         1 - ``alpha``, bool ``[N, n_classes]``.
@@ -178,12 +199,13 @@ class Adaptation:
             alpha: the share of windows whose true class may be missing, between 0 and 1.
             by_class: the share holds for the windows of each class, and not only of all. Needs
                 1 / alpha - 1 validation recordings of a class, which else is in every set.
+            extra: as for :meth:`predict`.
 
         Raises:
             ValueError: ``alpha`` is outside; a regression; or the adaptation was stored without
                 validation.
         """
-        return self.conformal.sets(self.predict_proba(x), alpha, by_class)
+        return self.conformal.sets(self.predict_proba(x, **extra), alpha, by_class)
 
     @cached_property
     def conformal(self) -> PredictionSets:

@@ -31,7 +31,7 @@ from adaptfault.models.heads import (
 )
 from adaptfault.models.history import History
 from adaptfault.models.kernels import Views
-from adaptfault.models.network import as_tensor, logits_of
+from adaptfault.models.network import as_tensor, batches, logits_of
 from adaptfault.models.targets import calibrate, log_likelihood
 from adaptfault.models.training import train
 from adaptfault.models.value_units import ValueUnits, foldable
@@ -106,7 +106,8 @@ class Run:
             case "head":
                 self.head()
             case "finetune":
-                self.head()
+                if not (self.fault_free.acts and len(self.fault_set)):
+                    self.head()
                 if len(self.fault_set):
                     self.finetune()
             case "auto":
@@ -131,10 +132,14 @@ class Run:
         """Train all parameters, front end included, in rounds that each end with a new head.
 
         It stops when rounds no longer improve validation. A larger budget allows more of the same
-        rounds, so its result is never worse.
+        rounds, so its result is never worse. A policy keeps its own last layer instead, and starts
+        from the fill: a head takes its time at each round, and again at each step of the robot.
         """
         network = copy.deepcopy(self.fault_free.model)
-        reduced = self._behind(self.fault_free.imputation.linear(self.fault_set), network)
+        front: nn.Module | None = self.fault_free.imputation.linear(self.fault_set)
+        if self.fault_free.acts:
+            front = copy.deepcopy(self.reduced.front)
+        reduced = self._behind(front, network)
         if self.fault_free.task == "classification" and network.head is not None:
             features = self._views(reduced, self.training).features.cpu().double().numpy()
             weight, bias = linear_head(features, self.training.y, network.n_classes)
@@ -175,7 +180,8 @@ class Run:
         """Return the outputs ``[N, n]`` for the validation windows, each from a head fitted without
         it."""
         if self.logits is None:
-            self.logits = logits_of(self._quickly(self.reduced), self.validation.x)
+            windows = self.validation
+            self.logits = logits_of(self._quickly(self.reduced), windows.x, windows.extra)
         return self.logits
 
     def accuracy(self) -> float:
@@ -214,7 +220,7 @@ class Run:
         before = self._quality(self.held_out())
         start = time.perf_counter()
         began = start if began is None else began
-        fitted = self._head(reduced)
+        fitted = self._head(reduced, own=name == "finetune" and self.fault_free.acts)
         if fitted is None:
             return False
         head, logits = fitted
@@ -257,14 +263,14 @@ class Run:
             return shares
         return log_likelihood(outputs, self.validation.y)
 
-    def _head(self, reduced: ReducedModel) -> tuple[Head | None, Tensor] | None:
+    def _head(self, reduced: ReducedModel, own: bool = False) -> tuple[Head | None, Tensor] | None:
         """Return a head, and the outputs for validation windows of heads fitted without them; None
         if time is short.
 
-        A model without features keeps its own head.
+        A model without features, or told to, keeps its ``own`` head.
         """
-        if not self.fault_free.has_features:
-            return None, logits_of(reduced, self.validation.x)
+        if own or not self.fault_free.has_features:
+            return None, logits_of(reduced, self.validation.x, self.validation.extra)
         if self._too_long(reduced, len(self.training) + len(self.validation)):
             return None
         used = evenly(len(self.training), MOST_WINDOWS - len(self.validation))
@@ -318,9 +324,10 @@ class Run:
         """Return the views of windows, computed in batches, on the device of the adapter."""
         quick = self._quickly(reduced.eval())
         with torch.no_grad():
-            views = [
-                quick.views(x.to(self.device)) for x in torch.split(as_tensor(windows.x), _BATCH)
-            ]
+            views = []
+            for x, extra in batches(as_tensor(windows.x), windows.extra, _BATCH):
+                others = {name: values.to(self.device) for name, values in extra.items()}
+                views.append(quick.views(x.to(self.device), **others))
         return Views(*(torch.cat(parts) for parts in zip(*views, strict=True)))
 
     def _too_long(self, reduced: ReducedModel, n: int) -> bool:
@@ -369,7 +376,7 @@ class Run:
         training, validation = self.training, self.validation
         units = None
         values = self.fault_free.task == "regression" and self.fault_free.loss is None
-        if values and foldable(reduced.network):
+        if values and foldable(reduced.network, training.extra):
             units = ValueUnits.of(training)
             if not fresh:
                 units.unfold(reduced.network)

@@ -532,6 +532,11 @@ def _check_parts(
             f"model, adapter and diagnoser need one array shape; got {model.layout} and"
             f" {diagnoser.layout}"
         )
+    if adapter.acts:
+        raise ValueError(
+            "a bundle holds a classifier or a regression of touch alone: store a policy with"
+            " save_adapter, or its repair with Adaptation.save"
+        )
     check_names(class_names, model.n_classes, adapter.task)
     if check is not None and check.y.shape[1:] != adapter.validation.y.shape[1:]:
         raise ValueError(

@@ -7,8 +7,8 @@ from numpy.typing import ArrayLike, NDArray
 
 
 def r2(true: ArrayLike, predicted: ArrayLike) -> float:
-    """Return the coefficient of determination of values ``[N, k]``, mean over those that vary; 0 if
-    none varies."""
+    """Return the coefficient of determination of values ``[N, ...]``, mean over those that vary; 0
+    if none varies."""
     return float(explained(true, predicted).mean())
 
 
@@ -20,6 +20,8 @@ def explained(true: ArrayLike, predicted: ArrayLike) -> NDArray[np.float64]:
     """
     t = np.asarray(true, dtype=np.float64)
     p = np.asarray(predicted, dtype=np.float64)
+    t = t.reshape(len(t), -1)
+    p = p.reshape(len(p), -1)
     variance = ((t - t.mean(axis=0)) ** 2).mean(axis=0)
     # a constant has the variance of rounding
     varies = t.min(axis=0) < t.max(axis=0)

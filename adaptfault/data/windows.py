@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
+from types import MappingProxyType
 from typing import Any, cast
 
 import numpy as np
@@ -25,16 +26,22 @@ class Windows:
     Attributes:
         x: float32 ``[N, T, D]``, readings divided by the layout's full scale: 0..1.
         y: int64 ``[N]``, class of each window, -1 where there is no label; or float32 ``[N, k]``,
-            the target values of a regression.
-        recording: int64 ``[N]``, which recording a window came from; splits keep these together.
+            the target values of a regression; or float32 ``[N, H, A]``, or of any other shape, the
+            actions of a policy.
+        recording: int64 ``[N]``, which recording or episode a window came from; splits keep these
+            together.
+        extra: what a policy sees beside touch, by name: ``[N, ...]`` each, as joint positions. No
+            repair changes it.
 
     Raises:
-        ValueError: ``x`` is not three-dimensional, or ``y`` or ``recording`` has another length.
+        ValueError: ``x`` is not three-dimensional, or ``y``, ``recording`` or another input has
+            another length.
     """
 
     x: NDArray[np.float32]
     y: NDArray[Any]
     recording: NDArray[np.int64]
+    extra: Mapping[str, NDArray[Any]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         x = plain_array(self.x).astype(np.float32, copy=False)
@@ -43,7 +50,7 @@ class Windows:
         object.__setattr__(self, "x", x)
         for name in ("y", "recording"):
             values = np.asarray(getattr(self, name))
-            if name == "y" and values.ndim == 2 and len(values) == len(x):
+            if name == "y" and values.ndim >= 2 and len(values) == len(x):
                 object.__setattr__(self, name, values.astype(np.float32, copy=False))
                 continue
             if values.shape != (len(x),):
@@ -51,6 +58,14 @@ class Windows:
                     f"{len(x)} windows need {name} of shape [{len(x)}], got {list(values.shape)}"
                 )
             object.__setattr__(self, name, values.astype(np.int64, copy=False))
+        extra = {name: np.asarray(values) for name, values in self.extra.items()}
+        for name, values in extra.items():
+            if values.ndim < 1 or len(values) != len(x):
+                raise ValueError(
+                    f"{len(x)} windows need the input {name!r} of shape [{len(x)}, ...], got"
+                    f" {list(values.shape)}"
+                )
+        object.__setattr__(self, "extra", extra)
 
     def __len__(self) -> int:
         return len(self.x)
@@ -74,6 +89,8 @@ class Windows:
         told = f"{len(np.unique(self.y[self.y >= 0]))} classes"
         if self.y.ndim == 2:
             told = "1 value" if self.y.shape[1] == 1 else f"{self.y.shape[1]} values"
+        elif self.y.ndim > 2:
+            told = f"actions {list(self.y.shape[1:])}"
         recordings = len(np.unique(self.recording))
         return f"{n} windows of {t} frames x {d} cells, {recordings} recordings, {told}"
 
@@ -82,7 +99,13 @@ class Windows:
         if not isinstance(which, slice):
             which = np.asarray(which)
             which = which if which.dtype == bool else which.astype(np.intp)
-        return Windows(self.x[which], self.y[which], self.recording[which])
+        extra = {name: values[which] for name, values in self.extra.items()}
+        return Windows(self.x[which], self.y[which], self.recording[which], extra)
+
+    @property
+    def flat(self) -> Windows:
+        """The windows with the actions ``[N, ...]`` of a policy as values ``[N, k]``."""
+        return self if self.y.ndim <= 2 else replace(self, y=self.y.reshape(len(self), -1))
 
 
 def evenly(n: int, most: int) -> NDArray[np.intp]:
@@ -131,6 +154,7 @@ def make_windows(
     *,
     length: int = 10,
     stride: int | None = None,
+    extra: Mapping[str, Sequence[ArrayLike]] = MappingProxyType({}),
 ) -> Windows:
     """Cut recordings into windows on the 0..1 scale.
 
@@ -142,16 +166,19 @@ def make_windows(
             differ.
         targets: of a classification, int ``[n]``, one class a recording; None gives y = -1. Of a
             regression, float ``[n, k]``, values of each recording, or a list of float ``[T, k]``,
-            values of each frame (``[T]``, as long as its recording: one value). A window has those
-            of its last frame, which is the present when a robot has read the window.
+            values of each frame (``[T]``, as long as its recording: one value). Of a policy, a list
+            of float ``[T, H, A]``, the chunk of actions that begins at each frame. A window has
+            those of its last frame, which is the present when a robot has read the window.
         layout: the array they come from.
         length: frames in a window, 10 in Section VI-C.
         stride: frames between the starts of two windows; None means ``length``, windows that do not
             overlap.
+        extra: what a policy sees beside touch, by name: for each recording an array ``[T, ...]``. A
+            window has the frames of its readings, ``[N, length, ...]``.
 
     Raises:
         ValueError: a recording that does not fit the layout, another number of targets, a value
-            that is not finite, no window at all.
+            that is not finite, no window at all; another input of another number of frames.
     """
     recordings = layout.recordings(recordings)
     stride = length if stride is None else stride
@@ -161,7 +188,9 @@ def make_windows(
         layout.check_recording(recording, f"recording {i}")
         for i, recording in enumerate(recordings)
     ]
-    of_frames = _targets_of_frames(targets, [len(recording) for recording in checked])
+    lengths = [len(recording) for recording in checked]
+    of_frames = _targets_of_frames(targets, lengths)
+    others = {name: _as_long(name, inputs, lengths) for name, inputs in extra.items()}
     y: list[NDArray[Any]] = []
     pieces: list[NDArray[np.float32]] = []
     counts = np.zeros(len(recordings), dtype=np.int64)
@@ -170,9 +199,8 @@ def make_windows(
         frames = hold_missing(scale(recording, layout))
         longest = max(longest, len(frames))
         if len(frames) >= length:
-            # [n, D, T]
-            views = np.lib.stride_tricks.sliding_window_view(frames, length, axis=0)[::stride]
-            pieces.append(views.transpose(0, 2, 1))
+            views = _cut(frames, length, stride)
+            pieces.append(views)
             counts[i] = len(views)
             y.append(of_frames[i][length - 1 :: stride])
     if not pieces:
@@ -181,7 +209,28 @@ def make_windows(
             f" recordings has {longest}"
         )
     x = np.ascontiguousarray(np.concatenate(pieces), dtype=np.float32)
-    return Windows(x, np.concatenate(y), np.repeat(np.arange(len(recordings)), counts))
+    cut = {
+        name: np.concatenate([_cut(of, length, stride) for of in inputs if len(of) >= length])
+        for name, inputs in others.items()
+    }
+    return Windows(x, np.concatenate(y), np.repeat(np.arange(len(recordings)), counts), cut)
+
+
+def _cut(frames: NDArray[Any], length: int, stride: int) -> NDArray[Any]:
+    """Return the windows ``[n, length, ...]`` of frames ``[T, ...]``."""
+    views = np.lib.stride_tricks.sliding_window_view(frames, length, axis=0)[::stride]
+    return np.moveaxis(views, -1, 1)
+
+
+def _as_long(name: str, inputs: Sequence[ArrayLike], lengths: Sequence[int]) -> list[NDArray[Any]]:
+    """Return an input of each recording, ``[T, ...]``; refuse one of another number of frames."""
+    each = [np.asarray(of) for of in inputs]
+    if [len(of) for of in each] != list(lengths):
+        raise ValueError(
+            f"the input {name!r} has {[len(of) for of in each][:5]} frames, the recordings"
+            f" {list(lengths)[:5]}: give an array [T, ...] for each recording"
+        )
+    return each
 
 
 def _targets_of_frames(
@@ -199,6 +248,8 @@ def _targets_of_frames(
     if not kinds <= set("iubf"):
         raise ValueError("targets are whole numbers (classes) or floats (values), nothing else")
     each = [np.atleast_1d(of).astype(np.float32) for of in each]
+    if all(of.ndim > 2 for of in each):
+        return _chunks_of_frames(each, lengths)
     if all(of.shape == (frames,) for of, frames in zip(each, lengths, strict=True)):
         each = [of[:, None] for of in each]
     widths = {of.shape[-1] for of in each}
@@ -217,6 +268,21 @@ def _targets_of_frames(
         if not np.isfinite(of).all():
             raise ValueError(f"the targets of recording {i} are not all finite")
     return [np.broadcast_to(of, (frames, k)) for of, frames in zip(each, lengths, strict=True)]
+
+
+def _chunks_of_frames(
+    each: Sequence[NDArray[np.float32]], lengths: Sequence[int]
+) -> list[NDArray[np.float32]]:
+    """Return the chunks of actions of the frames of each recording, ``[T, H, A]``."""
+    for i, (of, frames) in enumerate(zip(each, lengths, strict=True)):
+        if of.shape != (frames, *each[0].shape[1:]):
+            raise ValueError(
+                f"recording {i} has {frames} frames: expected actions"
+                f" {[frames, *each[0].shape[1:]]}, got {list(of.shape)}"
+            )
+        if not np.isfinite(of).all():
+            raise ValueError(f"the targets of recording {i} are not all finite")
+    return list(each)
 
 
 def recordings_of(windows: Windows, layout: SensorLayout) -> list[NDArray[np.float64]]:

@@ -148,18 +148,18 @@ class ValueScores:
 
     @classmethod
     def of(cls, true: ArrayLike, predicted: ArrayLike) -> ValueScores:
-        """Score predicted against true values, both float ``[N, k]``.
+        """Score predicted against true values, both float ``[N, k]``, or actions ``[N, ...]``.
 
         Raises:
             ValueError: no windows, or arrays of different shapes.
         """
         t = np.asarray(true, dtype=np.float64)
         p = np.asarray(predicted, dtype=np.float64)
-        if t.ndim != 2 or t.shape != p.shape or not len(t):
+        if t.ndim < 2 or t.shape != p.shape or not len(t):
             raise ValueError(
                 f"expected values of shape {list(t.shape)} [N, k], got {list(p.shape)}"
             )
-        return cls(r2(t, p), tuple(np.abs(t - p).mean(axis=0).tolist()), len(t))
+        return cls(r2(t, p), tuple(np.abs(t - p).mean(axis=0).ravel().tolist()), len(t))
 
     def __str__(self) -> str:
         return self.named()
@@ -332,7 +332,7 @@ def prediction_interval(
 def scored(true: ArrayLike, outputs: NDArray[Any]) -> Scores | ValueScores:
     """Score outputs ``[N, n]``: as values against true ones ``[N, n]``, or as logits or
     probabilities of the classes ``[N]``."""
-    if np.ndim(true) == 2:
+    if np.ndim(true) >= 2:
         return ValueScores.of(true, outputs)
     return Scores.of(true, outputs.argmax(1), n_classes=outputs.shape[1])
 
@@ -353,15 +353,16 @@ def evaluate(model: Classifier | Any, windows: Windows) -> Any:
     predict = getattr(model, "predict", None)
     if callable(predict) and windows.y.ndim == 1:  # a plain classifier is scored without torch
         n_classes = getattr(model, "n_classes", None)
-        return Scores.of(windows.y, predict(windows.x), n_classes=n_classes)
+        predicted = predict(windows.x, **windows.extra)
+        return Scores.of(windows.y, predicted, n_classes=n_classes)
     from torch import nn
 
     from adaptfault.models.network import logits_of
 
     if isinstance(model, nn.Module):
-        return scored(windows.y, logits_of(model, windows.x).numpy())
+        return scored(windows.y, logits_of(model, windows.x, windows.extra).numpy())
     if callable(predict):
-        return ValueScores.of(windows.y, predict(windows.x))
+        return ValueScores.of(windows.y, predict(windows.x, **windows.extra))
     raise TypeError(
         f"expected something with predict(x) or a torch module, got {type(model).__name__}"
     )

@@ -87,6 +87,7 @@ class RandomRepairs:
             np.concatenate([windows.x, repaired]),
             np.concatenate([windows.y, windows.y]),
             np.tile(windows.recording, 2),
+            {name: np.concatenate([values, values]) for name, values in windows.extra.items()},
         )
 
     @torch.no_grad()

@@ -1,10 +1,18 @@
-"""Wraps any torch module from windows to logits or values, and finds the features that a new head
-can use."""
+"""Wraps any torch module from windows to logits, values or actions, and finds the features that a
+new head can use.
+
+A policy sees more than touch and returns actions of any shape, as chunks ``[N, H, A]``. What else
+it sees passes through by name; its actions are values ``[N, H A]`` to all that repairs it. The
+closed-form head of a policy whose last layer gives each step of the chunk sees the features of all
+steps, side by side.
+"""
 
 from __future__ import annotations
 
 import copy
+import math
 from collections.abc import Callable, Mapping
+from types import MappingProxyType
 from typing import Any
 
 import torch
@@ -14,13 +22,13 @@ from adaptfault.models.builders import ModelNotAllowed, build_model, builder_of,
 from adaptfault.models.network import TactileTransformer, WindowModel, evaluating
 from diagnostics import SensorLayout
 
-Features = str | Callable[[nn.Module, Tensor], Tensor]
+Features = str | Callable[..., Tensor]
 _PROBE = 3  # windows of the test run; not 1 or 2, so that a batch axis in another place is noticed
 
 
 class AnyModel(WindowModel):
-    """A module from windows ``[N, T, D]`` to outputs ``[N, n]``, with the attributes that an
-    adaptation needs.
+    """A module from windows ``[N, T, D]`` to outputs ``[N, n]``, or to actions ``[N, ...]``, with
+    the attributes that an adaptation needs.
 
     Args:
         module: the model.
@@ -31,6 +39,9 @@ class AnyModel(WindowModel):
             None: no features.
         last_linear: ``layer`` is the last linear layer.
         function: computes the features from (module, x) instead of ``layer``.
+        shape: of the actions of a window, of ``n_classes`` numbers; None: ``[n_classes]``.
+        touch: the module takes a dict, with touch under this name; None: it takes touch first, and
+            what else it sees by name.
     """
 
     def __init__(
@@ -42,7 +53,9 @@ class AnyModel(WindowModel):
         *,
         layer: str | None = None,
         last_linear: bool = False,
-        function: Callable[[nn.Module, Tensor], Tensor] | None = None,
+        function: Callable[..., Tensor] | None = None,
+        shape: tuple[int, ...] | None = None,
+        touch: str | None = None,
     ) -> None:
         super().__init__()
         self.module = module
@@ -52,10 +65,20 @@ class AnyModel(WindowModel):
         self.layer = layer
         self.last_linear = last_linear
         self.function = function
+        self.shape = (n_classes,) if shape is None else tuple(shape)
+        self.touch = touch
 
     @classmethod
     def probe(
-        cls, module: nn.Module, layout: SensorLayout, x: Tensor, features: Features | None = None
+        cls,
+        module: nn.Module,
+        layout: SensorLayout,
+        x: Tensor,
+        features: Features | None = None,
+        *,
+        extra: Mapping[str, Tensor] = MappingProxyType({}),
+        touch: str | None = None,
+        actions: bool = False,
     ) -> AnyModel:
         """Run a module on windows ``x [N, T, D]`` and wrap it.
 
@@ -64,17 +87,22 @@ class AnyModel(WindowModel):
             layout: the array.
             x: some windows; the first 3 are used.
             features: name of the layer whose output is the feature vector, or a function of
-                (module, x [N, T, D]) that returns ``[N, p]``. None: the input of the last linear
-                layer, if there is one.
+                (module, x [N, T, D]), and what else the module sees by name, that returns
+                ``[N, p]``. None: the input of the last linear layer, if there is one.
+            extra: what else it sees for these windows, ``[N, ...]`` each.
+            touch: as for the class.
+            actions: the outputs may have any shape ``[N, ...]``.
 
         Raises:
-            ValueError: the forward pass fails, its output is not ``[N, n]``, or the named features
-                cannot be found.
+            ValueError: the forward pass fails, its output is not ``[N, n]`` or ``[N, ...]``, a
+                policy does not see touch, or the named features cannot be found.
         """
         shape = list(x[:_PROBE].shape)
-        wrapped = cls(module, layout, shape[1], 1)
+        wrapped = cls(module, layout, shape[1], 1, touch=touch)
         name = type(module).__name__
-        x = x[:_PROBE].to(device_of(module))
+        device = device_of(module)
+        x = x[:_PROBE].to(device)
+        others = {key: values[:_PROBE].to(device) for key, values in extra.items()}
         linear: dict[nn.Module, str] = {
             of: at for at, of in module.named_modules() if isinstance(of, nn.Linear)
         }
@@ -84,26 +112,33 @@ class AnyModel(WindowModel):
         ]
         try:
             with evaluating(module):
-                outputs = module(x)
+                outputs: Any = wrapped.call(x, others)
         except Exception as error:  # a model may raise anything
             raise ValueError(
-                f"{name} fails on windows of shape {shape}: {first_line(error)}; an adapter needs a"
-                " module from [N, T, D] to [N, n], so wrap one that takes another shape"
+                f"{name} fails on windows of shape {shape}{_and(others)}: {first_line(error)}; an"
+                " adapter needs a module from [N, T, D] to [N, n], so wrap one that takes another"
+                " shape"
             ) from None
         finally:
             for hook in hooks:
                 hook.remove()
-        if not isinstance(outputs, Tensor) or outputs.dim() != 2 or len(outputs) != len(x):
+        fits = isinstance(outputs, Tensor) and len(outputs) == len(x)
+        if not fits or outputs.dim() < 2 or (outputs.dim() > 2 and not actions):
             given = list(outputs.shape) if isinstance(outputs, Tensor) else type(outputs).__name__
+            expected = "..." if actions else "n"
             raise ValueError(
-                f"{name} returns {given} for windows of shape {shape}: expected [{len(x)}, n]"
+                f"{name} returns {given} for windows of shape {shape}: expected"
+                f" [{len(x)}, {expected}]"
             )
         if not torch.isfinite(outputs).all():
             raise ValueError(
                 f"{name} returns NaN or infinity for finite windows: give a model with finite"
                 " weights"
             )
-        wrapped.n_classes = outputs.shape[1]
+        wrapped.shape = tuple(outputs.shape[1:])
+        wrapped.n_classes = math.prod(wrapped.shape)
+        if others or len(wrapped.shape) > 1:
+            wrapped._check_touch(x, others, outputs)
         if isinstance(features, str):
             wrapped.layer = features
         elif features is not None:
@@ -111,10 +146,21 @@ class AnyModel(WindowModel):
         elif used:
             wrapped.layer = linear[used[-1][0]]
             wrapped.last_linear = True
-        wrapped._check_features(x, features)
+        wrapped._check_features(x, others, features)
         return wrapped
 
-    def _check_features(self, x: Tensor, given: Features | None) -> None:
+    def _check_touch(self, x: Tensor, extra: Mapping[str, Tensor], outputs: Tensor) -> None:
+        """Refuse a policy whose actions are the same whatever the cells read."""
+        with evaluating(self.module):
+            if torch.equal(self.call(1.0 - x, extra), outputs):
+                raise ValueError(
+                    f"{type(self.module).__name__} does not use touch: its actions stay the same"
+                    " whatever the cells read, so there is nothing to repair"
+                )
+
+    def _check_features(
+        self, x: Tensor, extra: Mapping[str, Tensor], given: Features | None
+    ) -> None:
         """Run the features once. What was found without being named is dropped if it is
         unusable."""
         if self.layer is None and self.function is None:
@@ -122,7 +168,7 @@ class AnyModel(WindowModel):
         name = type(self.module).__name__
         try:
             with evaluating(self):
-                found: Any = self.features(x)
+                found: Any = self.features(x, **extra)
             shape = list(found.shape) if isinstance(found, Tensor) else type(found).__name__
             problem = (
                 None
@@ -163,11 +209,21 @@ class AnyModel(WindowModel):
             layer if isinstance(layer, nn.Linear) and layer.out_features == self.n_classes else None
         )
 
-    def features(self, x: Tensor) -> Tensor:
-        """Map windows ``[N, T, D]`` to features ``[N, p]``; features of each frame are averaged
-        over time."""
+    def call(self, x: Tensor, extra: Mapping[str, Tensor]) -> Tensor:
+        """Return what the module itself returns for windows ``[N, T, D]`` and what else it sees."""
+        outputs: Tensor = (
+            self.module(x, **extra) if self.touch is None else self.module({self.touch: x, **extra})
+        )
+        return outputs
+
+    def features(self, x: Tensor, /, **extra: Tensor) -> Tensor:
+        """Map windows ``[N, T, D]``, and what else the module sees, to features ``[N, p]``.
+
+        Features of each frame are averaged over time; those of each step of the actions lie side by
+        side.
+        """
         if self.function is not None:
-            return self.function(self.module, x)
+            return self.function(self.module, x, **extra)
         if self.layer is None:
             raise ValueError(
                 f"{type(self.module).__name__} has no features: name a layer with features="
@@ -179,19 +235,23 @@ class AnyModel(WindowModel):
         else:
             hook = layer.register_forward_hook(lambda _, __, output: seen.append(output))
         try:
-            self.module(x)
+            self.call(x, extra)
         finally:
             hook.remove()
         if not seen:
             raise ValueError(f"the layer {self.layer!r} does not run in the forward pass")
         # recurrent layers return tuples
         values: Tensor = seen[-1][0] if isinstance(seen[-1], tuple) else seen[-1]
-        return values if values.dim() < 3 else values.flatten(1, -2).mean(1)
+        if values.dim() < 3:
+            return values
+        if len(self.shape) > 1 and values.shape[1:-1] == self.shape[:-1]:
+            return values.flatten(1)
+        return values.flatten(1, -2).mean(1)
 
-    def forward(self, x: Tensor) -> Tensor:
-        """Map windows ``[N, T, D]`` on the 0..1 scale to outputs ``[N, n]``."""
-        outputs: Tensor = self.module(x)
-        return outputs
+    def forward(self, x: Tensor, /, **extra: Tensor) -> Tensor:
+        """Map windows ``[N, T, D]`` on the 0..1 scale, and what else the module sees, to outputs
+        ``[N, n]``."""
+        return self.call(x, extra).flatten(1)
 
     @property
     def config(self) -> dict[str, Any]:
@@ -205,6 +265,8 @@ class AnyModel(WindowModel):
             "n_classes": self.n_classes,
             "layer": self.layer,
             "last_linear": self.last_linear,
+            "shape": list(self.shape),
+            "touch": self.touch,
         }
 
     @classmethod
@@ -234,6 +296,8 @@ class AnyModel(WindowModel):
             layer=config["layer"],
             last_linear=config["last_linear"],
             function=function,
+            shape=config.get("shape"),
+            touch=config.get("touch"),
         )
 
     def fresh(self, seed: int) -> AnyModel:
@@ -278,6 +342,12 @@ def not_resettable(module: nn.Module) -> list[str]:
         and not hasattr(layer, "_reset_parameters")
     )
     return list(dict.fromkeys(lacking))
+
+
+def _and(extra: Mapping[str, Tensor]) -> str:
+    """Return what a module sees beside touch, for a message."""
+    shapes = (f"{name} {list(values.shape)}" for name, values in extra.items())
+    return "".join(f", {shape}" for shape in shapes)
 
 
 def device_of(module: nn.Module) -> torch.device:

@@ -76,6 +76,9 @@ def fingerprint_windows(*windows: Windows) -> str:
         digest.update(str(w.x.shape).encode())
         digest.update(np.ascontiguousarray(w.x).data)
         digest.update(np.ascontiguousarray(w.y).data)
+        for name, values in w.extra.items():
+            digest.update(f"{name} {values.shape}".encode())
+            digest.update(np.ascontiguousarray(values).tobytes())
     return digest.hexdigest()
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from types import MappingProxyType
 from typing import Any, Literal
 
 import numpy as np
@@ -271,17 +272,45 @@ def as_tensor(array: NDArray[Any]) -> Tensor:
     return torch.from_numpy(np.require(array, requirements=("C", "W")))
 
 
-def logits_of(model: nn.Module, x: Batch, *, batch_size: int = 256) -> Tensor:
-    """Return the logits ``[N, n]`` of any module for ``x [N, ...]``: in eval mode, in batches,
-    without gradients.
+def logits_of(
+    model: nn.Module,
+    x: Batch,
+    extra: Mapping[str, Batch] = MappingProxyType({}),
+    *,
+    batch_size: int = 256,
+) -> Tensor:
+    """Return the logits ``[N, n]`` of any module for ``x [N, ...]``, and what else it takes by
+    name: in eval mode, in batches, without gradients.
 
     The result is on the CPU. Each module of ``model`` returns to its earlier mode.
     """
     windows = x if isinstance(x, Tensor) else as_tensor(plain_array(x).astype(np.float32))
     device = next((p.device for p in model.parameters()), windows.device)
-    batches = torch.split(windows, batch_size) if len(windows) else (windows,)
+    outputs = []
     with evaluating(model):
-        return torch.cat([model(batch.to(device, torch.float32)).cpu() for batch in batches])
+        for part, others in batches(windows, extra, batch_size):
+            placed = {name: values.to(device) for name, values in others.items()}
+            outputs.append(model(part.to(device, torch.float32), **placed).cpu())
+    return torch.cat(outputs)
+
+
+def batches(
+    x: Tensor, extra: Mapping[str, Batch], size: int
+) -> Iterator[tuple[Tensor, dict[str, Tensor]]]:
+    """Yield windows and what else a model sees, ``size`` at a time; once where there are none."""
+    named = tensors_of(extra)
+    for first in range(0, max(len(x), 1), size):
+        part = slice(first, first + size)
+        yield x[part], {name: values[part] for name, values in named.items()}
+
+
+def tensors_of(extra: Mapping[str, Batch]) -> dict[str, Tensor]:
+    """Return what a model sees beside touch as tensors; numbers that are not whole as float32."""
+    found: dict[str, Tensor] = {}
+    for name, values in extra.items():
+        of = values if isinstance(values, Tensor) else as_tensor(plain_array(values))
+        found[name] = of.float() if of.is_floating_point() else of
+    return found
 
 
 @contextmanager

@@ -45,7 +45,7 @@ from adaptfault.imputation.dropout import RandomRepairs
 from adaptfault.imputation.statistics import CellStatistics
 from adaptfault.models.checkpoint import fingerprint_weights, fingerprint_windows
 from adaptfault.models.history import History, Stopped
-from adaptfault.models.network import TactileTransformer, as_tensor, logits_of
+from adaptfault.models.network import TactileTransformer, as_tensor, logits_of, tensors_of
 from adaptfault.models.time_budget import Clock
 from adaptfault.models.training_run import Loss, TrainingRun
 from diagnostics import SensorLayout
@@ -89,9 +89,11 @@ def train(
     ``validation``, also after an exception or Ctrl-C; :mod:`adaptfault.models.training` has more.
 
     Args:
-        model: maps windows float32 ``[B, T, D]`` to logits or values ``[B, n]``. Parameters with
+        model: maps windows float32 ``[B, T, D]``, and what else the windows hold by name, to logits
+            or values ``[B, n]``, or to actions of any other shape. Parameters with
             ``requires_grad`` False stay as they are.
-        train, validation: fault-free windows, labels 0 to n - 1 or values float ``[N, n]``.
+        train, validation: fault-free windows, labels 0 to n - 1, values float ``[N, n]``, or
+            actions of the shape of the outputs.
         epochs, learning_rate, batch_size: of Adam; Section III-B has 50 at most, 1e-4 and 32.
         seed: of the order of the windows, of dropout and of ``augment``.
         patience: epochs without a better validation before stopping; None trains all epochs.
@@ -276,7 +278,8 @@ class _Training:
             x, y = self.source.take(index)
             if self.augment is not None:
                 x = self.augment(x, generator)
-            loss = run.loss(run.model(x.to(run.device)), y.to(run.device))
+            extra = {name: of[index].to(run.device) for name, of in self.source.extra.items()}
+            loss = run.loss(run.model(x.to(run.device), **extra), y.to(run.device))
             run.step(loss)
             total += loss.item() * len(index)
             seen += len(index)
@@ -294,7 +297,13 @@ class _Source:
     """The training windows and the additional ones."""
 
     def __init__(self, windows: Windows, more: MoreWindows | None) -> None:
+        if more is not None and windows.extra:
+            raise ValueError(
+                f"additional windows have no input {next(iter(windows.extra))!r}: train without"
+                " more, or on windows of touch alone"
+            )
         self.x = as_tensor(windows.x)
+        self.extra = tensors_of(windows.extra)
         self.more = more
         self.known = len(windows)
         self.y = as_tensor(windows.y if more is None else np.concatenate([windows.y, more.y]))
@@ -331,11 +340,15 @@ def _check(model: nn.Module, train: Windows, validation: Windows) -> None:
                 f"{bad} of {len(windows)} {name} windows hold NaN or infinite readings:"
                 " make_windows holds them"
             )
-        n = logits_of(model, windows.x[:1]).shape[1]
-        if windows.y.ndim == 2:
-            if windows.y.shape[1] != n or not np.isfinite(windows.y).all():
+        first = windows.select(slice(0, 1))
+        shape = logits_of(model, first.x, first.extra).shape[1:]
+        n = shape[0]
+        if windows.y.ndim >= 2:
+            if windows.y.shape[1:] != shape or not np.isfinite(windows.y).all():
+                needed = n if len(shape) == 1 else list(shape)
                 raise ValueError(
-                    f"{name} targets need {n} finite values a window, got {list(windows.y.shape)}"
+                    f"{name} targets need {needed} finite values a window, got"
+                    f" {list(windows.y.shape)}"
                 )
             continue
         if windows.y.min() < 0 or windows.y.max() >= n:
@@ -361,17 +374,17 @@ def _random_repairs(
 
 
 def _default_loss(windows: Windows) -> Loss:
-    return F.mse_loss if windows.y.ndim == 2 else F.cross_entropy
+    return F.mse_loss if windows.y.ndim >= 2 else F.cross_entropy
 
 
 def _validate(model: nn.Module, windows: Windows, criterion: Loss) -> tuple[float, float]:
     """Return loss, and accuracy or R2."""
-    logits = logits_of(model, windows.x)
+    logits = logits_of(model, windows.x, windows.extra)
     labels = as_tensor(windows.y)
     loss = criterion(logits, labels).item()
     if not math.isfinite(loss):
         raise ValueError(f"the validation loss became {loss}: lower learning_rate")
-    if windows.y.ndim == 2:
+    if windows.y.ndim >= 2:
         return loss, r2(windows.y, logits.numpy())
     return loss, (logits.argmax(1) == labels).double().mean().item()
 

@@ -8,8 +8,9 @@ deviation, so that the stored network returns values in their own unit.
 from __future__ import annotations
 
 import copy
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 
 import numpy as np
 import torch
@@ -18,7 +19,7 @@ from torch import Tensor, nn
 
 from adaptfault.data.windows import Windows
 from adaptfault.models.any_model import AnyModel
-from adaptfault.models.network import TactileTransformer, logits_of
+from adaptfault.models.network import Batch, TactileTransformer, logits_of
 
 _PROBES = 3  # windows of the test run
 
@@ -82,20 +83,27 @@ class ValueUnits:
 
 
 @torch.no_grad()
-def foldable(model: TactileTransformer | AnyModel) -> bool:
-    """Return whether the outputs of a model are those of a last linear layer with a bias."""
+def foldable(
+    model: TactileTransformer | AnyModel, extra: Mapping[str, Batch] = MappingProxyType({})
+) -> bool:
+    """Return whether the outputs of a model are those of a last linear layer with a bias.
+
+    ``extra`` is what else it sees of some windows, ``[N, ...]`` each.
+    """
     head = model.head
     if head is None or head.bias is None:
         return False
     rng = np.random.default_rng(0)
-    shape = (_PROBES, model.length, model.layout.n_cells)
+    probes = min([_PROBES, *map(len, extra.values())])
+    shape = (probes, model.length, model.layout.n_cells)
     x = rng.random(shape).astype(np.float32)
+    few = {name: values[:probes] for name, values in extra.items()}
     changed = copy.deepcopy(model)
-    before = logits_of(changed, x)
+    before = logits_of(changed, x, few)
     assert changed.head is not None
     changed.head.weight.mul_(2.0)
     changed.head.bias.mul_(2.0).add_(1.0)
-    return bool(torch.allclose(logits_of(changed, x), 2 * before + 1, rtol=1e-4, atol=1e-4))
+    return bool(torch.allclose(logits_of(changed, x, few), 2 * before + 1, rtol=1e-4, atol=1e-4))
 
 
 def _last_layer(model: TactileTransformer | AnyModel) -> nn.Linear:

@@ -4,7 +4,7 @@ injected."""
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -73,7 +73,7 @@ def with_faults(
         frames = windows.x[of_it].reshape(-1, windows.x.shape[2]) * layout.full_scale
         broken = inject(frames, always, layout, seed=seed + int(number)) / layout.full_scale
         x[of_it] = broken.reshape(windows.x[of_it].shape)
-    return Windows(x, windows.y, windows.recording)
+    return replace(windows, x=x)
 
 
 def measure_of(windows: Windows) -> str:

@@ -48,7 +48,10 @@ LESS = {  # they take minutes
     "fleet_scaling.py": ["--robots", "4", "--batch", "2", "--adapted", "1"],
     "iclabel.py": ["--components", "5"],
     "mujoco_bench.py": ["--small"],
+    "lerobot_policy.py": ["--quick"],
     "mujoco_gripper.py": ["--grasps", "1"],
+    "mujoco_lift.py": ["--episodes", "2"],
+    "mujoco_policy.py": ["--quick"],
 }
 SLOW = {  # they take long, or a test of the library proves the same
     "any_model.py",
@@ -68,11 +71,14 @@ SLOW = {  # they take long, or a test of the library proves the same
     "iclabel.py",
     "io_errors.py",
     "kill_maintenance.py",
+    "lerobot_policy.py",
     "lerobot_set.py",
     "monitor_alarms.py",
     "monitor_cost.py",
     "mujoco_bench.py",
     "mujoco_gripper.py",
+    "mujoco_lift.py",
+    "mujoco_policy.py",
     "own_model.py",
     "picture.py",
     "power_cut.py",
@@ -100,8 +106,11 @@ SLOW_ON_RECORDINGS = {
 NEEDS = {
     "deploy_speed.py": "onnxruntime",
     "iclabel.py": "mne_icalabel",
+    "lerobot_policy.py": "lerobot",
     "mujoco_bench.py": "mujoco",
     "mujoco_gripper.py": "mujoco",
+    "mujoco_lift.py": "mujoco",
+    "mujoco_policy.py": "mujoco",
     "ros_latency.py": "rclpy",
 }
 

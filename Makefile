@@ -113,8 +113,9 @@ format: .venv/installed-dev
 	@touch $@
 
 install-dev:
-	$(INSTALL) $(CONSTRAINTS) -e '.[dev]' -e './packages/adaptfault-bench[mujoco]' -e ./packages/adaptfault-firmware -e ./packages/adaptfault-paper \
-		-e ./packages/adaptfault-prognosis -e './packages/adaptfault-station[ros2]' -e ./packages/lerobot_policy_adaptfault
+	$(INSTALL) $(CONSTRAINTS) -e '.[dev]' -e './packages/adaptfault-bench[mujoco]' -e ./packages/adaptfault-firmware \
+		-e './packages/adaptfault-fleet[dask]' -e ./packages/adaptfault-paper -e ./packages/adaptfault-prognosis \
+		-e './packages/adaptfault-station[ros2]' -e './packages/adaptfault-viewers[ros,view]' -e ./packages/lerobot_policy_adaptfault
 
 .venv/installed-docs: .venv/installed
 	$(INSTALL) $(CONSTRAINTS) -e '.[docs]'

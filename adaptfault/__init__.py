@@ -34,9 +34,9 @@ if TYPE_CHECKING:
     from adaptfault.data.windows import Windows, make_windows, split
     from adaptfault.evaluation.scores import Scores, ValueScores, evaluate
     from adaptfault.evaluation.sensitivity import Sensitivity, analyse, sensitivity
-    from adaptfault.fleet.listing import Fleet
-    from adaptfault.fleet.run import maintain_fleet
-    from adaptfault.fleet.summary import FleetReport
+    from adaptfault.fleet.listing import Fleet as Fleet
+    from adaptfault.fleet.run import maintain_fleet as maintain_fleet
+    from adaptfault.fleet.summary import FleetReport as FleetReport
     from adaptfault.imputation.restorer import Restorer
     from adaptfault.imputation.scikit_learn import (
         CellImputer,
@@ -60,9 +60,10 @@ if TYPE_CHECKING:
     from adaptfault.prediction.reading import Reading
     from adaptfault.robot.maintenance import maintain
     from adaptfault.robot.maintenance_report import MaintenanceReport
-    from adaptfault.robot.ros_diagnostics import diagnostic_array, write_diagnostics
     from adaptfault.robot.routine import Routine
     from adaptfault.robot.selftest import plan_selftest
+    from adaptfault.viewers.ros_diagnostics import diagnostic_array as diagnostic_array
+    from adaptfault.viewers.ros_diagnostics import write_diagnostics as write_diagnostics
 
 __path__ = extend_path(__path__, __name__)  # the packages of the repository add rooms
 __version__ = "0.1.0"
@@ -78,8 +79,6 @@ __all__ = [
     "FaultTolerantRegressor",
     "Finding",
     "Findings",
-    "Fleet",
-    "FleetReport",
     "Forecast",
     "GuardError",
     "History",
@@ -107,7 +106,6 @@ __all__ = [
     "analyse",
     "build_model",
     "correct",
-    "diagnostic_array",
     "evaluate",
     "guard",
     "inspect",
@@ -116,7 +114,6 @@ __all__ = [
     "load_healthy",
     "load_model",
     "maintain",
-    "maintain_fleet",
     "make_windows",
     "plan_selftest",
     "save",
@@ -131,7 +128,6 @@ __all__ = [
     "train",
     "train_fault_aware",
     "worst_faults",
-    "write_diagnostics",
 ]
 
 _HOMES = {
@@ -178,7 +174,7 @@ _HOMES = {
     "analyse": "evaluation.sensitivity",
     "build_model": "models.builders",
     "correct": "adaptation.baselines.correction",
-    "diagnostic_array": "robot.ros_diagnostics",
+    "diagnostic_array": "viewers.ros_diagnostics",
     "evaluate": "evaluation.scores",
     "guard": "inspection.guard",
     "inspect": "inspection.inspection",
@@ -203,7 +199,7 @@ _HOMES = {
     "train": "models.training",
     "train_fault_aware": "adaptation.baselines.fault_aware",
     "worst_faults": "adaptation.worst",
-    "write_diagnostics": "robot.ros_diagnostics",
+    "write_diagnostics": "viewers.ros_diagnostics",
 }
 
 

@@ -28,17 +28,18 @@ for package in (adaptfault, diagnostics):
 print(f"{len(adaptfault.__all__) + len(diagnostics.__all__)} public names, all there")
 """
 ALONE = """
-import adaptfault
-try:
-    adaptfault.Station
-except ImportError as error:
-    assert "pip install adaptfault-station" in str(error), error
-else:
-    raise AssertionError("the core brings a station")
+import sys, adaptfault
+for name, package in zip(sys.argv[1::2], sys.argv[2::2]):
+    try:
+        getattr(adaptfault, name)
+    except ImportError as error:
+        assert f"pip install {package}" in str(error), error
+    else:
+        raise AssertionError(f"the core brings {name}")
 """
 BESIDE = """
-import sys, adaptfault, adaptfault.bench, adaptfault.firmware, adaptfault.lerobot, adaptfault.paper
-import adaptfault.prognosis, adaptfault.ros2
+import sys, adaptfault, adaptfault.bench, adaptfault.firmware, adaptfault.fleet, adaptfault.lerobot
+import adaptfault.paper, adaptfault.prognosis, adaptfault.ros2, adaptfault.viewers
 import diagnostics.simulation.circuit as circuit
 for package in (adaptfault.bench, circuit, sys.modules[adaptfault.Station.__module__]):
     assert package.__file__.startswith(sys.prefix), package.__file__
@@ -47,9 +48,16 @@ APART = {
     "export-monitor": "adaptfault-firmware",
     "listen": "adaptfault-station",
     "reproduce": "adaptfault-paper",
-    "fleet survival": "adaptfault-prognosis",
+    "fleet maintain": "adaptfault-fleet",
+    "view": "adaptfault-viewers",
 }
 """The package that brings a command."""
+NAMES = {
+    "Station": "adaptfault-station",
+    "Fleet": "adaptfault-fleet",
+    "diagnostic_array": "adaptfault-viewers",
+}
+"""The package that brings a public name."""
 ROUNDS = 5  # of each start that is timed; the best counts
 BAD_INPUT = 3
 
@@ -120,7 +128,8 @@ def main(dist: Path) -> None:
         print("installing the core into an empty environment (torch is large)", flush=True)
         elsewhere.install([core])
         elsewhere.run(elsewhere.python, "-c", CORE)
-        elsewhere.run(elsewhere.python, "-c", ALONE)
+        names = [word for pair in NAMES.items() for word in pair]
+        elsewhere.run(elsewhere.python, "-c", ALONE, *names)
         for command, package in APART.items():
             (line,) = elsewhere.told(command).splitlines()
             assert f"pip install {package}" in line, line

@@ -110,7 +110,7 @@ def write_page(
     """Write the page that ``--html`` asks for; it says what the exit code and the notes say."""
     if not args.html:
         return
-    from adaptfault.viewers.html_diagnosis import HEADLINES, OF_A_DATA_SET, write_diagnosis
+    from adaptfault.pages.html_diagnosis import HEADLINES, OF_A_DATA_SET, write_diagnosis
 
     name = ", ".join(args.recordings)
     write_diagnosis(

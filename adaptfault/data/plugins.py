@@ -13,10 +13,14 @@ from typing import Any
 APART = {
     "adaptfault.acquisition": "adaptfault-station",
     "adaptfault.cli.export_monitor": "adaptfault-firmware",
+    "adaptfault.cli.fleet": "adaptfault-fleet",
     "adaptfault.cli.listen": "adaptfault-station",
     "adaptfault.cli.reproduce": "adaptfault-paper",
+    "adaptfault.cli.view": "adaptfault-viewers",
     "adaptfault.firmware": "adaptfault-firmware",
+    "adaptfault.fleet": "adaptfault-fleet",
     "adaptfault.prognosis": "adaptfault-prognosis",
+    "adaptfault.viewers": "adaptfault-viewers",
 }
 """The package that brings a module, where it is installed on its own."""
 

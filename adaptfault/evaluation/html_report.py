@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from adaptfault.viewers.html_page import Picture, render
+from adaptfault.pages.html_page import Picture, render
 from diagnostics import FaultSet
 from diagnostics.decision.plot import draw_forces, pads_figure
 

@@ -146,7 +146,7 @@ def _done(work: Work, numbers: Sequence[int], jobs: int, dask: str | None) -> It
 def _on_dask(work: Work, numbers: Sequence[int], dask: str) -> Iterator[Made]:
     from distributed import as_completed
 
-    from adaptfault.fleet.engines import connected
+    from adaptfault.data.cluster import connected
 
     with connected(dask) as client:
         futures = client.map(partial(made, work), numbers, pure=False)

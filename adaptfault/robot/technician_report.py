@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any
 from adaptfault.bundle.bundle import Bundle
 from adaptfault.bundle.pointer import Pointer
 from adaptfault.evaluation.class_recall import class_name
+from adaptfault.pages.html_page import Picture, render
 from adaptfault.robot.sensor_state import SensorState, unhandled_cells
-from adaptfault.viewers.html_page import Picture, render
 from diagnostics import Diagnosis
 from diagnostics.decision.grouped_faults import by_group
 from diagnostics.decision.numbering import Numbering

@@ -19,11 +19,16 @@ from adaptfault.acquisition.watch import WAITING, Watch
 from adaptfault.data.calibration import Calibration
 from adaptfault.data.recordings.formats.message_arrays import arrays_at, join, put
 from adaptfault.imputation.restorer import Restorer
-from adaptfault.robot.ros_diagnostics import Level, diagnostic_array, stale_array, write_diagnostics
 from adaptfault.ros2 import parameters
 from adaptfault.ros2.parameters import DEFAULTS, Parameters, quoted, unknown
 from adaptfault.ros2.rounds import Part, Rounds
 from adaptfault.ros2.sensor import sensor_of
+from adaptfault.viewers.ros_diagnostics import (
+    Level,
+    diagnostic_array,
+    stale_array,
+    write_diagnostics,
+)
 from diagnostics import (
     Fault,
     FaultKind,
@@ -170,7 +175,7 @@ def test_what_is_written_into_a_bag_is_read_back(fitted, log, tmp_path):
 
 def test_writing_without_rosbags_says_what_to_install(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "rosbags.rosbag2", None)
-    with pytest.raises(ValueError, match="adaptfault\\[ros\\]"):
+    with pytest.raises(ValueError, match="adaptfault-viewers\\[ros\\]"):
         write_diagnostics(tmp_path / "bag", [stale_array(LAYOUT)])
 
 

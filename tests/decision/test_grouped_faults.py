@@ -1,6 +1,6 @@
 """Single faults in a named group are told as the group."""
 
-from adaptfault.viewers.html_diagnosis import write_diagnosis
+from adaptfault.pages.html_diagnosis import write_diagnosis
 from diagnostics import Diagnosis, Fault, FaultKind, Line, SensorLayout
 from diagnostics.decision.grouped_faults import by_group
 

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from adaptfault.viewers.html_diagnosis import write_diagnosis
+from adaptfault.pages.html_diagnosis import write_diagnosis
 from diagnostics import Diagnosis, Fault, Line, SensorLayout
 from diagnostics.decision.coverage import where
 from diagnostics.decision.numbering import Numbering

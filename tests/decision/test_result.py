@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from adaptfault.viewers.html_diagnosis import write_diagnosis
+from adaptfault.pages.html_diagnosis import write_diagnosis
 from diagnostics import Diagnosis, Fault, FaultKind, Line, SensorLayout, TransportFault, Verdict
 
 LAYOUT = SensorLayout(2, 4, 5)

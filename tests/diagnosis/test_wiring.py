@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from adaptfault.data.simulated_grasps import simulate
-from adaptfault.robot.ros_diagnostics import diagnostic_array, stale_array
+from adaptfault.viewers.ros_diagnostics import diagnostic_array, stale_array
 from diagnostics import (
     Diagnosis,
     Fault,

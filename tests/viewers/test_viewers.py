@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from adaptfault.data.recordings import InputError
-from adaptfault.robot.ros_diagnostics import diagnostic_array
 from adaptfault.viewers.mcap_file import CELL, write_mcap
 from adaptfault.viewers.rerun_file import write_rrd
+from adaptfault.viewers.ros_diagnostics import diagnostic_array
 from adaptfault.viewers.timed_log import COLOURS, State, TimedLog
 from diagnostics import Diagnosis, Fault, Line, SensorLayout
 
@@ -258,7 +258,7 @@ def test_rerun_lists_faults_at_their_onset_and_recordings(batches):
 @pytest.mark.parametrize(("write", "package"), [(write_mcap, "mcap.writer"), (write_rrd, "rerun")])
 def test_a_missing_package_is_named_with_its_remedy(write, package, log, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, package, None)
-    with pytest.raises(InputError, match=r"install it: pip install 'adaptfault\[view\]'"):
+    with pytest.raises(InputError, match=r"install it: pip install 'adaptfault-viewers\[view\]'"):
         write(tmp_path / "log.x", log)
     assert list(tmp_path.iterdir()) == []
 

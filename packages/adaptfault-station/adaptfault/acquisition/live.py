@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 from adaptfault.acquisition.ordering import Frame
 from adaptfault.acquisition.relay import FrameRepair, in_place
 from adaptfault.acquisition.session import Event, Session
-from adaptfault.robot.ros_diagnostics import Level, diagnostic_array, stale_array
 from adaptfault.viewers.mcap_file import McapArray, McapMessages, check_mcap
 from adaptfault.viewers.rerun_file import RerunArray, blueprint, check_rerun
+from adaptfault.viewers.ros_diagnostics import Level, diagnostic_array, stale_array
 from adaptfault.viewers.timed_log import ROOT, Piece, State, on_grid, states_of
 from diagnostics import Diagnosis, FaultSet, SensorLayout
 

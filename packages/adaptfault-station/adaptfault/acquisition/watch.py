@@ -22,7 +22,7 @@ from adaptfault.acquisition.ordering import Frame
 from adaptfault.acquisition.relay import FrameRepair, in_place
 from adaptfault.acquisition.scanning import Scans
 from adaptfault.inspection.converter_range import within_range
-from adaptfault.robot.ros_diagnostics import Level, diagnostic_array, stale_array
+from adaptfault.viewers.ros_diagnostics import Level, diagnostic_array, stale_array
 from diagnostics import Fault, FaultSet, Monitor, ReadOut, with_scan
 
 GRACE = 5.0  # seconds after the start in which no frame is a WARN, and STALE afterwards
@@ -39,7 +39,7 @@ class Watch:
 
     Args:
         sensor: as the bundle or the layout states it.
-        name, hardware_id: of :func:`~adaptfault.robot.ros_diagnostics.diagnostic_array`.
+        name, hardware_id: of :func:`~adaptfault.viewers.ros_diagnostics.diagnostic_array`.
         lines_held: of the scans of the read-out, as in :class:`diagnostics.Scan`.
         clock: seconds, never set back.
     """

@@ -60,7 +60,9 @@ def write_rrd(path: str | PathLike[str], log: TimedLog) -> None:
 def check_rerun(path: str | PathLike[str]) -> None:
     """Raise InputError where the package rerun-sdk is not installed; ``path``: of the file to
     write."""
-    what = "RRD files are written with rerun-sdk; install it: pip install 'adaptfault[view]'"
+    what = (
+        "RRD files are written with rerun-sdk; install it: pip install 'adaptfault-viewers[view]'"
+    )
     imported("rerun", path, what)
 
 

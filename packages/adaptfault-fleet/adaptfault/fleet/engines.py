@@ -3,7 +3,6 @@ per robot."""
 
 from __future__ import annotations
 
-import re
 import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
@@ -12,6 +11,7 @@ from functools import partial
 from queue import SimpleQueue
 from typing import TYPE_CHECKING
 
+from adaptfault.data.cluster import WAIT, connected
 from adaptfault.fleet.guard import Guard, Task, do_on_worker, quiet
 from adaptfault.fleet.listing import Robot
 from adaptfault.fleet.outcome import Outcome
@@ -22,9 +22,7 @@ if TYPE_CHECKING:
 Engine = Callable[[Sequence[Robot]], Iterator[Outcome]]
 """Maintains robots and yields their outcomes in order of completion."""
 
-_WAIT = 60  # s to wait for a cluster's first worker, and without any worker later
 _LOOK = 0.1  # s between two checks for finished robots
-_ADDRESS = re.compile(r"(\w+://)?[^\s/]+:\d+")
 _DIED = "every Dask worker that processed it died; memory may be short"
 
 
@@ -50,34 +48,6 @@ def engine(task: Task, *, jobs: int | None, dask: str | None) -> Iterator[Engine
         return
     with connected(dask) as client:
         yield partial(_on_dask, client, task)
-
-
-@contextmanager
-def connected(dask: str) -> Iterator[Client]:
-    """Return the client of a Dask scheduler that has a worker.
-
-    Args:
-        dask: its address, as ``tcp://host:8786``.
-
-    Raises:
-        ValueError: Dask is not installed, or the address has no port.
-        OSError: no scheduler answers at the address, or it has no worker.
-    """
-    try:
-        from distributed import Client
-    except ImportError:
-        raise ValueError("a Dask cluster needs Dask: pip install 'adaptfault[fleet]'") from None
-    # a client of a wrong address waits for a minute before it fails
-    if not _ADDRESS.fullmatch(dask):
-        raise ValueError(f"{dask!r}: expected the address of a Dask scheduler, as tcp://host:8786")
-    with Client(dask, set_as_default=False) as client:
-        try:
-            client.wait_for_workers(1, timeout=_WAIT)
-        except Exception as error:  # its own TimeoutError, which differs between versions
-            raise OSError(
-                f"the Dask scheduler at {dask} has no worker after {_WAIT} s ({error})"
-            ) from None
-        yield client
 
 
 def _on_joblib(task: Task, guards: Sequence[Guard], robots: Sequence[Robot]) -> Iterator[Outcome]:
@@ -142,12 +112,12 @@ def _finished(
             yield (robot := robot_of.pop(future)), _outcome(future, robot)
         if not coming.has_ready():
             time.sleep(_LOOK)
-        if (idle := time.monotonic() - seen) > _WAIT / 10:
+        if (idle := time.monotonic() - seen) > WAIT / 10:
             if client.nthreads():
                 seen = time.monotonic()
-            elif idle > _WAIT:
+            elif idle > WAIT:
                 raise OSError(
-                    f"no Dask worker for {_WAIT} s; start workers, then the run again to resume it"
+                    f"no Dask worker for {WAIT} s; start workers, then the run again to resume it"
                 )
 
 

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from adaptfault.data.atomic import atomic_file
 from adaptfault.data.recordings.formats.datasets.extra import imported
-from adaptfault.robot.ros_diagnostics import TOPIC, diagnostic_array
+from adaptfault.viewers.ros_diagnostics import TOPIC, diagnostic_array
 from adaptfault.viewers.timed_log import COLOURS, ROOT, Piece, TimedLog
 from diagnostics import SensorLayout
 
@@ -66,7 +66,7 @@ def write_mcap(path: str | PathLike[str], log: TimedLog) -> None:
 
 def check_mcap(path: str | PathLike[str]) -> None:
     """Raise InputError where the package mcap is not installed; ``path``: of the file to write."""
-    what = "MCAP files are written with mcap; install it: pip install 'adaptfault[view]'"
+    what = "MCAP files are written with mcap; install it: pip install 'adaptfault-viewers[view]'"
     imported("mcap.writer", path, what)
 
 

@@ -114,7 +114,8 @@ def write_diagnostics(
         from rosbags.typesys import Stores, get_typestore
     except ImportError:
         raise ValueError(
-            f"{path}: bags are written with rosbags; install it: pip install 'adaptfault[ros]'"
+            f"{path}: bags are written with rosbags; install it:"
+            " pip install 'adaptfault-viewers[ros]'"
         ) from None
     if Path(path).exists():
         raise ValueError(f"{path} exists already; give the bag another name")

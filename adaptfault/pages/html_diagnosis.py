@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import Literal
 
-from adaptfault.viewers.html_page import Picture, render
+from adaptfault.pages.html_page import Picture, render
 from diagnostics import Diagnosis
 from diagnostics.decision.grouped_faults import by_group
 from diagnostics.decision.numbering import Numbering
@@ -86,7 +86,7 @@ def write_diagnosis(
         )
     return render(
         path,
-        "viewers/diagnosis.html",
+        "pages/diagnosis.html",
         name=name,
         state=state,
         notes=[

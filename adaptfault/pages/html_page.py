@@ -11,6 +11,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import adaptfault
 from adaptfault.data.atomic import atomic_write
 from diagnostics.decision.coverage import percent
 from diagnostics.decision.plot import PAGE
@@ -32,11 +33,10 @@ def render(
     Raises:
         OSError: the folder cannot be written.
     """
-    from jinja2 import Environment, PackageLoader, StrictUndefined
+    from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
-    environment = Environment(
-        loader=PackageLoader("adaptfault", "."), autoescape=True, undefined=StrictUndefined
-    )
+    rooms = FileSystemLoader(list(adaptfault.__path__))
+    environment = Environment(loader=rooms, autoescape=True, undefined=StrictUndefined)
     environment.filters["percent"] = percent
     environment.filters["legend"] = legend
     path = Path(path)

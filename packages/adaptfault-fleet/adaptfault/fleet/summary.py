@@ -221,7 +221,7 @@ class FleetReport:
         Raises:
             OSError: the file cannot be written.
         """
-        from adaptfault.viewers.html_page import render
+        from adaptfault.pages.html_page import render
 
         return render(path, "fleet/fleet.html", report=self)
 

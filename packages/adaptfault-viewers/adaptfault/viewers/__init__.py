@@ -1,0 +1,1 @@
+"""Files that people look at: MCAP for Foxglove, RRD for Rerun, and the diagnostics of ROS."""

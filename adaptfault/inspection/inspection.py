@@ -1,7 +1,7 @@
 """Inspection of a log: everything that is told of it.
 
-What all cells share is explained first: it is taken out where it can be, and where that leaves
-fewer faults. Then the wiring and replaced pads are undone, and then cells are judged.
+Exchanged wires and replaced pads are undone. Then the diagnosis judges the cells, as
+:meth:`diagnostics.SelfDiagnosis.diagnose` does. What all cells share is told beside it.
 """
 
 from __future__ import annotations
@@ -20,11 +20,9 @@ from adaptfault.inspection.result import Finding, Inspection, finding_of, of_dia
 from diagnostics import Diagnosis, FaultSet, SelfDiagnosis, SensorLayout
 from diagnostics.diagnosis import checked_recordings
 from diagnostics.preprocessing.readings import RecordingBlocks
-from diagnostics.sensor.common_mode import CommonMode, find_common_mode
-from diagnostics.sensor.converter_change import find_converter_change
+from diagnostics.sensor.common_mode import find_common_mode
 from diagnostics.sensor.disturbance import Disturbance, find_disturbances, find_sentinel
-from diagnostics.sensor.gain import GAIN
-from diagnostics.sensor.sensor_change import SensorChange, amplification
+from diagnostics.sensor.sensor_change import SensorChange
 from diagnostics.sensor.shared import measured
 
 _OF_ALL_CELLS = ("quantised", "saturated", "normalised")
@@ -49,8 +47,7 @@ def inspect(
         reference: these recordings. None: nothing is compared with them.
         classes: the class of each recording of the log, ``[n]``, with which a fault may coincide;
             None: unknown.
-        progress: receives the share of the fit that is done, where a cold start fits to the log, or
-            where the converter changed and the reference is learned as it would read it.
+        progress: receives the share of the fit that is done, where a cold start fits to the log.
 
     Raises:
         ValueError: recordings that do not fit the layout, or hold no frame.
@@ -72,13 +69,11 @@ def inspect(
     if diagnoser.reference_ is None:
         fitted = diagnoser.for_log(log, classes=classes, progress=progress)
         alone = ChangedReadings(None, None, log, fitted.diagnose(log, classes=classes))
-        told = _Told(alone, None, disturbances)
+        told = _Told(alone, disturbances)
         if not crosstalk:
             told.change = _change(alone, healthy, diagnoser, disturbances)
     else:
-        told = _compared(given, log, healthy, diagnoser, disturbances, crosstalk, progress)
-    if told.common is not None:
-        told.disturbances.append(told.common.disturbance)
+        told = _compared(given, log, healthy, diagnoser, disturbances, crosstalk)
     if told.change is not None:  # measures it
         told.disturbances = [one for one in told.disturbances if one.name != "offset"]
     readings = replace(told.readings, diagnosis=shared.told(told.readings.diagnosis))
@@ -92,7 +87,7 @@ def inspect(
         findings += [
             finding_of("coincides", text) for text in coinciding(readings.diagnosis, classes)
         ]
-    return Inspection(readings, tuple(findings), told.change, told.common)
+    return Inspection(readings, tuple(findings), told.change)
 
 
 def _usable(
@@ -109,13 +104,11 @@ class _Told:
 
     Attributes:
         readings: with what changed between cells and readings.
-        common: the common mode that they do without.
         disturbances: of the array.
         change: of a pad or of the sensor.
     """
 
     readings: ChangedReadings
-    common: CommonMode | None
     disturbances: list[Disturbance]
     change: SensorChange | None = None
 
@@ -127,45 +120,28 @@ def _compared(
     diagnoser: SelfDiagnosis,
     disturbances: list[Disturbance],
     crosstalk: bool,
-    progress: Callable[[float], None],
 ) -> _Told:
     """Return what is told of a log beside the reference that the diagnosis is fitted to.
 
     Args:
         given, log, healthy, disturbances: as for :func:`_disturbances`, and what it returned.
         crosstalk: the lines of the log have it, which the cells of a pad share, too.
-        progress: of a fit to the reference as a changed converter would read it.
     """
     layout = diagnoser.layout
-    disturbed = crosstalk or any(one.name in _OF_ALL_CELLS for one in disturbances)
+    of_all = crosstalk or any(one.name in _OF_ALL_CELLS for one in disturbances)
     compared = [] if crosstalk else healthy
-    told = _Told(*_judged(log, compared, diagnoser, disturbed=disturbed), disturbances)
-    others = _without_groups(log, told.readings.diagnosis)
+    common = _common_mode(log, compared, diagnoser)
+    disturbed = of_all or common is not None
+    readings = find_changed_readings(
+        diagnoser, log, compared, disturbed=disturbed, comparable=not of_all
+    )
+    others = _without_groups(log, readings.diagnosis)
     if others is not None:  # what a bus does is no disturbance of all
-        told.disturbances = _disturbances(given, others, healthy, layout)
-    if crosstalk:
-        return told
-    converter = None
-    if diagnoser.load_ is None:
-        converter = find_converter_change(log, healthy, layout, told.disturbances)
-    if converter is not None:
-        seen = converter.of(healthy)
-        behind = SelfDiagnosis(**diagnoser.get_params()).fit(seen, progress=progress)
-        readings, common = _judged(log, seen, behind, disturbed=disturbed)
-        if len(readings.diagnosis.fault_set) <= len(told.readings.diagnosis.fault_set):
-            told.readings = readings
-            told.common = common
-            diagnoser = behind
-            healthy = seen
-            if max(converter.gain, 1 / converter.gain) >= GAIN:
-                told.change = amplification(converter.gain, len(log))
-                return told
-    shifted = [*told.disturbances]
-    if told.common is not None:
-        shifted.append(told.common.disturbance)
-    left_in = _with_offset(told.readings, told.common, log)
-    told.change = _change(left_in, healthy, diagnoser, shifted)
-    return told
+        disturbances = _disturbances(given, others, healthy, layout)
+    if common is not None and not _is_group(readings.diagnosis):
+        disturbances = [*disturbances, common]
+    change = None if crosstalk else _change(readings, healthy, diagnoser, disturbances)
+    return _Told(readings, disturbances, change)
 
 
 def _disturbances(
@@ -199,43 +175,16 @@ def _without_groups(
     return [np.where(faulty, np.nan, frames) for frames in log]
 
 
-def _judged(
-    log: list[NDArray[np.float64]],
-    healthy: list[NDArray[np.float64]],
-    diagnoser: SelfDiagnosis,
-    *,
-    disturbed: bool,
-) -> tuple[ChangedReadings, CommonMode | None]:
-    """Return the diagnosis of a log, and the common mode that it does without; None: the log as it
-    is.
-
-    A common mode is one explanation beside the faults that it explains away. ``disturbed``: other
-    disturbances are known.
-    """
+def _common_mode(
+    log: list[NDArray[np.float64]], healthy: list[NDArray[np.float64]], diagnoser: SelfDiagnosis
+) -> Disturbance | None:
+    """Return what the cells of a pad share beyond the reference; None where a gain of all cells
+    explains it."""
     common = find_common_mode(log, healthy, diagnoser.layout) if healthy else None
-    if common is not None:  # where all cells read more, so does what they share
-        usual = diagnoser.without_gain(log)
-        if usual is not None and find_common_mode(list(usual), healthy, diagnoser.layout) is None:
-            common = None
-    as_it_is = find_changed_readings(
-        diagnoser,
-        log,
-        healthy,
-        disturbed=disturbed or common is not None,
-        comparable=not disturbed,
-    )
-    if common is None:
-        return as_it_is, None
-    undone = common.undo(log, diagnoser.layout)
-    without = find_changed_readings(
-        diagnoser, undone, healthy, disturbed=True, comparable=not disturbed
-    )
-    explanations = len(without.diagnosis.faults) + 1
-    if explanations > len(as_it_is.diagnosis.faults) and _is_group(as_it_is.diagnosis):
-        return as_it_is, None
-    if without.diagnosis.n_lost > as_it_is.diagnosis.n_lost:
-        return as_it_is, None
-    return without, common
+    usual = None if common is None else diagnoser.without_gain(log)
+    if usual is not None and find_common_mode(list(usual), healthy, diagnoser.layout) is None:
+        return None
+    return common
 
 
 def _is_group(diagnosis: Diagnosis) -> bool:
@@ -243,15 +192,6 @@ def _is_group(diagnosis: Diagnosis) -> bool:
     those of a common mode."""
     kinds = {fault.line.kind for fault in diagnosis.faults if fault.line is not None}
     return not kinds.isdisjoint(("converter", "bus", "group", "position"))
-
-
-def _with_offset(
-    readings: ChangedReadings, common: CommonMode | None, log: list[NDArray[np.float64]]
-) -> ChangedReadings:
-    """Return the readings with a constant shift left in: it is a change of the sensor."""
-    if common is None or common.disturbance.name != "offset" or readings.reason:
-        return readings
-    return replace(readings, frames=log)
 
 
 def _change(

@@ -89,7 +89,6 @@ def _without_frames(inspection: Inspection) -> Inspection:
     return replace(
         inspection,
         readings=replace(inspection.readings, frames=[], as_found=None),
-        common_mode=None,
     )
 
 

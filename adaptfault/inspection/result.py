@@ -14,7 +14,6 @@ from diagnostics import Diagnosis, Fault
 from diagnostics.shown import shown
 
 if TYPE_CHECKING:
-    from diagnostics.sensor.common_mode import CommonMode
     from diagnostics.sensor.recalibration import Recalibration
     from diagnostics.sensor.rewiring import Rewiring
     from diagnostics.sensor.sensor_change import SensorChange
@@ -73,18 +72,14 @@ class Inspection:
     """What a log tells about a sensor.
 
     Attributes:
-        readings: of the log with wires and pads put back, and without what the cells share; their
-            diagnosis.
+        readings: of the log with wires and pads put back; their diagnosis.
         findings: in the order in which they are told.
         change: of a pad, or of the whole sensor, against the reference; None where there is none.
-        common_mode: what the cells share, which the diagnosis does without; None where there is
-            nothing to take out.
     """
 
     readings: ChangedReadings
     findings: tuple[Finding, ...]
     change: SensorChange | None = None
-    common_mode: CommonMode | None = None
 
     @property
     def diagnosis(self) -> Diagnosis:

@@ -64,12 +64,6 @@ class SensorChange:
         return np.where(has_changed, self.gain, 1.0), np.where(has_changed, self.offset, 0.0)
 
 
-def amplification(gain: float, recordings: int) -> SensorChange:
-    """Return the change of a sensor whose converter now amplifies by ``gain``."""
-    reason = f"sensor changed: readings are about {gain:.2g}x of what they were"
-    return SensorChange(gain, 0.0, recordings, reason)
-
-
 def find_change(
     recordings: Sequence[NDArray[Any]],
     reference: Sequence[NDArray[Any]],

@@ -34,9 +34,9 @@ def inspect_parts(
     :func:`adaptfault.inspection.inspection.inspect`.
 
     One part is inspected as a whole. Of several, each is inspected for itself: wires and pads are
-    put back, and what its cells share is taken out. The cells are judged from all of them together,
-    and from the range of each in each recording. In a cold start the first part alone may be the
-    reference of all. The result holds no readings.
+    put back. The cells are judged from all of them together, and from the range of each in each
+    recording. In a cold start the first part alone may be the reference of all. The result holds no
+    readings.
 
     Args:
         parts: at least one list of recordings ``[T, D]``, in time order.

@@ -37,7 +37,6 @@ def find_changed_readings(
     healthy: Sequence[NDArray[Any]],
     *,
     disturbed: bool = False,
-    comparable: bool = True,
 ) -> ChangedReadings:
     """Return what changed between cells and readings, and the diagnosis with it undone.
 
@@ -46,19 +45,17 @@ def find_changed_readings(
         frames: recordings ``[T, D]``, as the running version undoes them.
         healthy: those of the reference, with which pads are compared.
         disturbed: a disturbance of the array may explain what differs: then no pad counts as
-            replaced, and wires as exchanged only where fewer cells are faulty once they are put
-            back.
-        comparable: readings are neither cut off nor rounded otherwise than the reference: they tell
-            one sensor from another.
+            replaced, no recording as of another sensor, and wires as exchanged only where fewer
+            cells are faulty once they are put back.
     """
     exchanged = _put_back(diagnoser, frames)
-    if exchanged is not None and exchanged.rewiring is not None and comparable:
+    if exchanged is not None and exchanged.rewiring is not None and not disturbed:
         still = _another(diagnoser, exchanged, healthy)
         if still is not None and still.is_whole:  # the wires do not explain it
             exchanged = None
     as_found = ChangedReadings(None, None, frames, diagnoser.diagnose(frames))
     another = None
-    if exchanged is None and comparable:
+    if exchanged is None and not disturbed:
         another = _another(diagnoser, as_found, healthy)
         if another is None:
             own = _as_own_reference(diagnoser, as_found, healthy)

@@ -7,8 +7,8 @@ For pad p and piece t, with r the rest of each cell and d what it drifted by sin
         the pad (shorth, Andrews et al. 1972),
     w = 1 where it is narrow, 0 where it is twice as wide
 
-Cell i shows a share a_i of it, learned from the reference and then, in turn with c, from the log:
-rank one, by alternating least squares. It is subtracted where
+Cell i shows a share a_i of it, learned from the reference; where the reference never saw as much,
+in turn with c from the log (rank one, by alternating least squares). It is subtracted where
 the interval is narrow, compared with m: no contact is so even. A contact with most of a pad hides
 what it shares; then that is what it shared before or after it in the same recording. All cells of
 the pad tell, constant ones as well, but at either end of the converter: those that are trusted
@@ -44,7 +44,6 @@ _RESTS = 0.25  # share of the recordings in which a cell rests at some time, at 
 _WIDER = 8.0  # than their interval is the spread of all, where these rest and others do not
 _LASTS = 0.25  # share of the pieces in which a pad has drifted, at least
 _ROUNDS = 3
-_IN_TURN = 2
 _SURE = 20.0  # pieces that a share of 1 is worth
 _MOST = 2.0  # share of the offset of a pad that a cell shows in a log; in the reference 1
 _BLOCK = 64  # pieces of a recording that are looked at as one
@@ -59,8 +58,7 @@ _NOISIER = 2.0  # times as noisy, or coarse, as the reference
 _UNSEEN = 1.5  # times what the reference usually shows: it never saw as much
 _FEWEST_STEPS = 3  # between the readings of a cell that has steps
 _APART = 10.0  # times what n readings of a range are apart at least, range / n^2: by steps
-_SATURATES = 0.1  # of the loaded readings of a cell are at the top
-_SOME = 0.25  # of the cells: those that loads bring to the top
+_SATURATES = 0.1  # of the loaded readings of a usual cell are at the top
 _WITHIN = 4.0  # standard deviations
 _UNSTEADY = 0.05  # of full scale: the rest of a cell differs between recordings by less
 
@@ -98,7 +96,7 @@ class Rest:
         settles: bool ``[D]``, cells that come to rest in nearly all recordings of the reference.
         pressed: bool ``[D]``, cells of pads that a contact loads as a whole, and as evenly.
         step: of the converter.
-        at_top: share of the loaded readings that are at the top, see :meth:`share_at_top`.
+        at_top: share of the loaded readings of a usual cell that are at the top.
     """
 
     level: Array
@@ -127,18 +125,27 @@ class Rest:
         drift = self.drift(record, telling)
         above = record.mean - self.level - drift
         share = self.share
-        for _ in range(_IN_TURN):
-            of_pads = replace(self, share=share).of_pads(record, telling, drift)
-            own = _share(above, of_pads, self.near, self.share)
-            # on a pad that shares no more than in the reference, one that does not follow is odd
-            unseen = _usually(of_pads, _OFTEN) > _UNSEEN * self.offsets
-            share = np.where(unseen | (own > _EVEN * self.share), own, self.share)
+        of_pads = self.of_pads(record, telling, drift)
+        # what the reference shows tells more, unless it never saw as much
+        unseen = _usually(of_pads, _OFTEN) > _UNSEEN * self.offsets
+        if unseen.any():
+            own = _share(above, of_pads, self.near, share)
+            in_turn = self.of_pads(record, telling, drift, own)
+            own = _share(above, in_turn, self.near, share)
+            of_pads = np.where(unseen, in_turn, of_pads)
+            share = np.where(unseen, own, share)
         unseen |= (drift != 0).mean(axis=0) > _LASTS
         return Shared(drift, drift + share * of_pads, unseen)
 
-    def of_pads(self, record: Record, telling: Mask, drift: Array | float = 0.0) -> Array:
+    def of_pads(
+        self,
+        record: Record,
+        telling: Mask,
+        drift: Array | float = 0.0,
+        share: Array | None = None,
+    ) -> Array:
         """Return the offset of each cell's pad in each piece, ``[n, D]``, beside the ``drift`` of
-        each cell."""
+        each cell; ``share``: ``[D]``, of it that each cell shows; None: all show the same."""
         found = np.zeros(record.mean.shape, np.float32)
         above = record.mean - self.level - drift
         stuck = self._stuck(record, above)
@@ -153,9 +160,9 @@ class Rest:
                 tell = live
             if len(tell) < _FEWEST:
                 continue
-            # in units of a usual cell: else all shares shrink, and what they are of grows
-            of_usual = self.share[tell] / np.median(self.share[tell])
-            alike = above[:, tell] / of_usual
+            alike = above[:, tell]
+            if share is not None:  # of a usual cell's: else all shrink, and what they are of grows
+                alike = alike * np.median(share[tell]) / np.maximum(share[tell], _EVEN)
             of_pad = np.sort(np.where(at_end[:, tell], np.nan, alike), axis=1)
             noise = float(np.median(self.near[tell]))
             finest = max(self.least, min(noise, float(np.median(self.noise[tell]))))
@@ -261,15 +268,15 @@ class Rest:
         return self.share_at_top(record, above, telling) > _SATURATES + _NOISIER * self.at_top
 
     def share_at_top(self, record: Record, above: Array, telling: Mask) -> float:
-        """Return the share of the loaded readings that are at the top: a quarter of the cells have
-        it at least; arguments as for :meth:`noise_of`."""
+        """Return the share of the loaded readings of a usual cell that are at the top; arguments as
+        for :meth:`noise_of`."""
         top = record.mean >= self.full * (1 - DITHER)
         count = (top | (above > self.near)).sum(axis=0)
         returns = (top[:-1] & ~top[1:]).any(axis=0)
         stuck = top[-1] & ~returns
         used = telling & (count > 0) & ~stuck
         shares = top.sum(axis=0)[used] / count[used]
-        return float(np.quantile(shares, 1 - _SOME)) if used.any() else 0.0
+        return float(np.median(shares)) if used.any() else 0.0
 
     def noise_of(self, record: Record, above: Array, telling: Mask) -> Array:
         """Return how far a cell reads from rest by noise, ``[D]``.

@@ -10,9 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adaptfault.inspection.changed_readings import ChangedReadings, Frames
-from diagnostics import Diagnosis, FaultKind, FaultSet, SelfDiagnosis
+from diagnostics import Diagnosis, FaultKind, FaultSet, SelfDiagnosis, SensorLayout
 from diagnostics.preprocessing.levels import EXPECTED, LEAST_LOADED, MAJORITY
 from diagnostics.sensor.another_sensor import AnotherSensor, find_another_sensor
+from diagnostics.sensor.disturbance import rest_of
 from diagnostics.sensor.recalibration import Recalibration, find_recalibration
 from diagnostics.sensor.rewiring import Rewiring
 from diagnostics.sensor.sensor_change import SensorChange, find_change
@@ -37,6 +38,7 @@ def find_changed_readings(
     healthy: Sequence[NDArray[Any]],
     *,
     disturbed: bool = False,
+    comparable: bool = True,
 ) -> ChangedReadings:
     """Return what changed between cells and readings, and the diagnosis with it undone.
 
@@ -45,17 +47,19 @@ def find_changed_readings(
         frames: recordings ``[T, D]``, as the running version undoes them.
         healthy: those of the reference, with which pads are compared.
         disturbed: a disturbance of the array may explain what differs: then no pad counts as
-            replaced, no recording as of another sensor, and wires as exchanged only where fewer
-            cells are faulty once they are put back.
+            replaced, and wires as exchanged only where fewer cells are faulty once they are put
+            back.
+        comparable: readings are neither cut off nor rounded otherwise than the reference: they tell
+            one sensor from another.
     """
     exchanged = _put_back(diagnoser, frames)
-    if exchanged is not None and exchanged.rewiring is not None and not disturbed:
+    if exchanged is not None and exchanged.rewiring is not None and comparable:
         still = _another(diagnoser, exchanged, healthy)
         if still is not None and still.is_whole:  # the wires do not explain it
             exchanged = None
     as_found = ChangedReadings(None, None, frames, diagnoser.diagnose(frames))
     another = None
-    if exchanged is None and not disturbed:
+    if exchanged is None and comparable:
         another = _another(diagnoser, as_found, healthy)
         if another is None:
             own = _as_own_reference(diagnoser, as_found, healthy)
@@ -151,13 +155,33 @@ def _another(
     excluded = _explained(diagnosis)
     if with_faulty:
         excluded = np.ptp(np.concatenate(frames), axis=0) == 0
-    return find_another_sensor(
-        as_loads(diagnoser, list(frames)),
-        as_loads(diagnoser, healthy),
-        diagnoser.reference_,
-        diagnoser.layout,
-        excluded,
-    )
+    loads = as_loads(diagnoser, list(frames))
+    reference = as_loads(diagnoser, healthy)
+    asked = reference, diagnoser.reference_, diagnoser.layout, excluded
+    found = find_another_sensor(loads, *asked)
+    if found is None:
+        return None
+    # what all cells of a pad read more is an offset of it
+    same_rest = _without_offsets(loads, reference, diagnoser.layout)
+    return None if find_another_sensor(same_rest, *asked) is None else found
+
+
+def _without_offsets(
+    loads: Sequence[NDArray[Any]], reference: Sequence[NDArray[Any]], layout: SensorLayout
+) -> list[NDArray[Any]]:
+    """Return loads ``[T, D]`` without the offset of each pad, by which most of its cells rest
+    higher than in the reference, all alike: those of another sensor differ."""
+    higher = rest_of(loads, layout) - rest_of(reference, layout)
+    offset = np.zeros(layout.n_cells)
+    for pad in range(layout.pads):
+        on = layout.pad_of == pad
+        known = higher[on & np.isfinite(higher)]
+        if not len(known):
+            continue
+        low, middle, high = np.quantile(known, [LEAST_LOADED, 0.5, 1 - LEAST_LOADED]).tolist()
+        if high - low < MAJORITY * abs(middle):
+            offset[on] = middle
+    return [frames - offset for frames in loads]
 
 
 def _left(diagnosis: Diagnosis) -> Diagnosis:

@@ -128,11 +128,13 @@ def _compared(
         crosstalk: the lines of the log have it, which the cells of a pad share, too.
     """
     layout = diagnoser.layout
+    of_all = crosstalk or any(one.name in _OF_ALL_CELLS for one in disturbances)
     compared = [] if crosstalk else healthy
     common = _common_mode(log, compared, diagnoser)
-    disturbed = crosstalk or common is not None
-    disturbed |= any(one.name in _OF_ALL_CELLS for one in disturbances)
-    readings = find_changed_readings(diagnoser, log, compared, disturbed=disturbed)
+    disturbed = of_all or common is not None
+    readings = find_changed_readings(
+        diagnoser, log, compared, disturbed=disturbed, comparable=not of_all
+    )
     others = _without_groups(log, readings.diagnosis)
     if others is not None:  # what a bus does is no disturbance of all
         disturbances = _disturbances(given, others, healthy, layout)

@@ -58,6 +58,9 @@ def find_changed_readings(
         if still is not None and still.is_whole:  # the wires do not explain it
             exchanged = None
     as_found = ChangedReadings(None, None, frames, diagnoser.diagnose(frames))
+    if exchanged is not None and disturbed:
+        explains = exchanged.diagnosis.n_lost < as_found.diagnosis.n_lost
+        exchanged = exchanged if explains else None
     another = None
     if exchanged is None and comparable:
         another = _another(diagnoser, as_found, healthy)
@@ -68,7 +71,7 @@ def find_changed_readings(
     if another is not None and not another.is_whole:
         left = another.left_out(frames)
         return ChangedReadings(None, None, left, _left(diagnoser.diagnose(left)), another=another)
-    if disturbed and (exchanged is None or exchanged.diagnosis.n_lost >= as_found.diagnosis.n_lost):
+    if disturbed and exchanged is None:
         return as_found if another is None else _as_another(as_found, another)
     replaced = _with_new_gains(diagnoser, as_found, healthy, exchanged)
     if replaced is not None:

@@ -143,7 +143,7 @@ def extremes_of(recordings: Recordings) -> tuple[Floats, Floats]:
     return lowest, highest
 
 
-def moving_cells(recordings: Recordings, layout: SensorLayout) -> tuple[NDArray[np.bool_], Floats]:
+def _moving_cells(recordings: Recordings, layout: SensorLayout) -> tuple[NDArray[np.bool_], Floats]:
     """Return the cells whose readings differ, bool ``[D]``, and the highest reading of each,
     ``[D]``."""
     low, high = extremes_of(recordings)
@@ -217,14 +217,14 @@ def _saturated(
 ) -> Disturbance | None:
     rest = rest_of(reference, layout)
     near = SLIGHT * layout.full_scale
-    moving, high = moving_cells(recordings, layout)
+    moving, high = _moving_cells(recordings, layout)
     if not moving.any():
         return None
     top = float(high[moving].max())
     at_top = high[moving] >= top
     before = float(np.nanmax(extremes_of(reference)[1][moving]))
     new, old = (
-        np.array([share_at(frames[:, moving], level, rest[moving] + near) for frames in given])
+        np.array([_share_at(frames[:, moving], level, rest[moving] + near) for frames in given])
         for given, level in ((recordings, top), (reference, before))
     )
     if not _differs(new, old) or np.median(new) < MARGIN * LOW or at_top.mean() < LEAST_LOADED:
@@ -235,7 +235,7 @@ def _saturated(
     )
 
 
-def share_at(frames: Floats, level: float, loaded_from: Floats | float = -np.inf) -> float:
+def _share_at(frames: Floats, level: float, loaded_from: Floats) -> float:
     """Return the share of the received readings above ``loaded_from`` that are at least ``level``;
     0 without any."""
     loaded = frames > loaded_from

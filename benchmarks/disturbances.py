@@ -219,7 +219,7 @@ def monitored(bench: Bench) -> Iterator[Count]:
     """Healthy streams of 40 recordings through the Monitor."""
     raised = 0
     for _, log, _ in bench.logs(IN_USE):
-        monitor = Monitor(bench.fitted)
+        monitor = Monitor(bench.fitted, wait=True)
         for frame in np.concatenate(log):
             raised += sum(fault.probability > 0 for fault in monitor.update(frame))
     yield Count("a healthy stream: alarms", raised, bench.count, higher=False)

@@ -3,6 +3,7 @@ batch diagnosis."""
 
 from __future__ import annotations
 
+import logging
 from concurrent.futures import Future
 from copy import copy
 from dataclasses import dataclass, replace
@@ -24,12 +25,15 @@ if TYPE_CHECKING:
     from diagnostics.evidence.stream_state import StreamState
     from diagnostics.faults import Fault
 
+_log = logging.getLogger(__name__)
+
 Key = tuple[Line | None, int]
 Frames = list[tuple[int, NDArray[np.float64]]]  # lost before it, frame [D]
 
 # seconds that an evaluation takes on a busy machine: for a cell, and for a reading of its record
 _A_CELL = 1e-3
 _A_READING = 2e-5
+_LATE = 10  # times the frames that an evaluation is given
 _LONGEST_GAP = 86400.0  # seconds; after a longer one the clock was set
 
 
@@ -37,10 +41,13 @@ class Monitor:
     """Monitors a running sensor and reports faults that are new, have changed, or are gone.
 
     After each segment of 32 frames a thread of the monitor's own evaluates them, and the 16th frame
-    after it tells what changed. Which frame tells which fault does not depend on the speed of the
-    machine: where the evaluation is not complete by then, that frame waits for it. A large array,
-    and a long log, are given more frames: those of 1 ms a cell and of 20 us a reading of the record
-    that is judged, at the rate of the array.
+    after it tells what changed. A large array, and a long log, are given more frames: those of 1 ms
+    a cell and of 20 us a reading of the record that is judged, at the rate of the array.
+
+    A control loop must not stall: where the evaluation is not complete by then, the first frame by
+    which it is tells. A replay feeds frames faster than the sensor does, and would be told late, or
+    only by :meth:`flush`: it waits (``wait``), and which frame tells which fault does not depend on
+    the speed of the machine.
 
     While a wire breaks, healthy cells beside it look faulty for an evaluation, so a change is
     reported once the next evaluation confirms it, at most about 80 frames after it becomes
@@ -48,14 +55,15 @@ class Monitor:
 
     Args:
         fitted: a fitted :class:`SelfDiagnosis`; an unfitted one is a cold start.
-
+        wait: for replays: the frame that is to tell waits until the evaluation is complete.
     """
 
-    def __init__(self, fitted: SelfDiagnosis) -> None:
+    def __init__(self, fitted: SelfDiagnosis, *, wait: bool = False) -> None:
         import scipy.ndimage  # imported here, not in the control loop
         import scipy.optimize  # noqa: F401
 
         self._diagnoser = fitted
+        self._waits = wait
         self._record = _Record(fitted.stream())
         self._work: Future[_Record] | _Record | None = None  # with those given
         self._given: Frames = []
@@ -66,6 +74,7 @@ class Monitor:
         self._evaluated: Diagnosis | None = None
         self._settled: Diagnosis | None = None
         self._time: float | None = None
+        self._warned = False
 
     def __getstate__(self) -> dict[str, Any]:
         """Return what a copy or a pickle holds; it waits for an evaluation under way."""
@@ -105,10 +114,24 @@ class Monitor:
         self._new.append((lost, reading))
         changes: tuple[Fault, ...] = ()
         if self._work is not None and len(self._new) >= self._told_after:
+            if not self._waits and not _is_complete(self._work):
+                self._warn()
+                return ()
             changes = self._collect(self._work)
         if len(self._new) >= self._every:
             self._begin()
         return changes
+
+    def _warn(self) -> None:
+        """Say once that evaluations come far too late."""
+        if self._warned or len(self._new) < _LATE * self._told_after:
+            return
+        self._warned = True
+        _log.warning(
+            "frames come faster than they can be evaluated: %d since the last evaluation began;"
+            " call flush() for what they show, or replay with Monitor(fitted, wait=True)",
+            len(self._new),
+        )
 
     def _pace(self, pieces: int) -> tuple[int, int]:
         """Return after how many frames an evaluation of so many pieces tells what changed, and the
@@ -128,7 +151,7 @@ class Monitor:
         )
 
     def _collect(self, work: Future[_Record] | _Record) -> tuple[Fault, ...]:
-        """Wait for the evaluation under way, and return its changes."""
+        """Return the changes of an evaluation; wait for it."""
         try:
             self._record = _result(work)
         except Exception:
@@ -240,6 +263,11 @@ class _Record:
 
     stream: StreamState
     diagnosis: Diagnosis | None = None
+
+
+def _is_complete(work: Future[_Record] | _Record) -> bool:
+    """Return whether an evaluation is."""
+    return isinstance(work, _Record) or work.done()
 
 
 def _result(work: Future[_Record] | _Record) -> _Record:

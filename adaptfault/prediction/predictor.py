@@ -61,6 +61,7 @@ class Predictor:
             (:mod:`adaptfault.models.accumulation`).
         sets: :meth:`stream` also gives the set of classes of each window that holds the true one
             with probability 1 - ``sets``; None: no sets.
+        wait: for replays, see :class:`diagnostics.Monitor`.
 
     Raises:
         FileNotFoundError, ValueError: no version of the bundle can be loaded; ``accumulate`` or
@@ -73,8 +74,10 @@ class Predictor:
         *,
         accumulate: bool = False,
         sets: float | None = None,
+        wait: bool = False,
     ) -> None:
         self._open = open_bundle
+        self._wait = wait
         self._sets = sets
         self._accumulate = accumulate
         bundle = open_bundle()
@@ -87,7 +90,7 @@ class Predictor:
         self._failed: int | None = None  # number of the version that could not be loaded
         self._told: set[str] = set()  # problems that were logged
         self._diagnoser = _reference(bundle)
-        self._monitor = Monitor(self._diagnoser)
+        self._monitor = Monitor(self._diagnoser, wait=self._wait)
         self.layout = bundle.layout
         self.class_names = tuple(bundle.class_names)
         self.outside = 0  # readings outside the range so far
@@ -112,9 +115,10 @@ class Predictor:
         least_serial: int = 0,
         accumulate: bool = False,
         sets: float | None = None,
+        wait: bool = False,
     ) -> Predictor:
-        """Open the bundle in a folder and start its active version; ``accumulate`` and ``sets`` as
-        in the class.
+        """Open the bundle in a folder and start its active version; ``accumulate``, ``sets`` and
+        ``wait`` as in the class.
 
         Args:
             path: of the bundle.
@@ -131,12 +135,13 @@ class Predictor:
             lambda: Bundle.open(path, keys=keys, least_serial=least_serial),
             accumulate=accumulate,
             sets=sets,
+            wait=wait,
         )
 
     def sibling(self) -> Predictor:
         """Return a predictor of the running version for another device; nothing is read for it."""
         other = copy.copy(self)
-        other._monitor = Monitor(self._diagnoser)
+        other._monitor = Monitor(self._diagnoser, wait=self._wait)
         other._loading = other._ready = None
         if self._loading is not None:
             other._stamp = None  # it looks by itself for the version that is being loaded
@@ -314,7 +319,7 @@ class Predictor:
                 # the frames so far read otherwise
                 if before.version.readings != self._running.version.readings:
                     self._diagnoser = _reference(self._running.bundle)
-                    self._monitor = Monitor(self._diagnoser)
+                    self._monitor = Monitor(self._diagnoser, wait=self._wait)
                     self.reset()
                 self._decision = self._new_decision()
                 _log.info("version %d runs now", self.version)

@@ -85,7 +85,7 @@ def test_faults_are_reported_in_the_sensors_own_readings(low, high, log):
 
 
 def test_the_monitor_says_the_same_frame_by_frame(low, high, log):
-    monitors = Monitor(low), Monitor(high)
+    monitors = Monitor(low, wait=True), Monitor(high, wait=True)
     first = log[0][: len(log[0]) // 2]
     told = [
         [(fault.cells, fault.line) for frame in frames for fault in monitor.update(frame)]

@@ -42,7 +42,7 @@ def test_one_impossible_reading_counts_as_missing(
 
 @pytest.mark.usefixtures("seldom_evaluated")
 def test_the_monitor_still_finds_faults_after_one(fitted: SelfDiagnosis, log: np.ndarray):
-    monitor = Monitor(fitted)
+    monitor = Monitor(fitted, wait=True)
     news = [fault for frame in with_one(log, np.inf) for fault in monitor.update(frame)]
     assert any(57 in fault.cells for fault in news)
     assert monitor.diagnosis().to_dict() == fitted.diagnose(with_one(log, np.inf)).to_dict()

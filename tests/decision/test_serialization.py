@@ -64,8 +64,8 @@ def test_one_without_a_reference_does_too(grasps, log):
 
 @pytest.mark.usefixtures("seldom_evaluated")
 def test_frame_by_frame_it_gives_the_same_result(fitted, log):
-    was = Monitor(fitted)
-    restored = Monitor(stored(fitted))
+    was = Monitor(fitted, wait=True)
+    restored = Monitor(stored(fitted), wait=True)
     news = [(was.update(frame), restored.update(frame)) for frame in log[:700]]
     assert any(one for one, _ in news)
     assert all(one == other for one, other in news)

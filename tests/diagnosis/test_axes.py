@@ -106,7 +106,7 @@ def test_a_dead_axis_is_a_cell_and_a_dead_position_one_cause(fitted: SelfDiagnos
     assert "row" not in "".join(fault.reason for fault in diagnosis.faults)
     assert Diagnosis.from_dict(diagnosis.to_dict()).faults == diagnosis.faults
     assert len(diagnosis.map().splitlines()) == 7
-    monitor = Monitor(SelfDiagnosis.from_state(*fitted.state()))
+    monitor = Monitor(SelfDiagnosis.from_state(*fitted.state()), wait=True)
     for frame in np.concatenate(log):
         monitor.update(frame)
     assert monitor.diagnosis().faults == diagnosis.faults

@@ -135,7 +135,7 @@ def test_where_many_cells_contradict_at_once_the_sensor_is_disturbed_and_no_cell
 def test_frame_by_frame_a_floating_cell_is_told_as_in_batch(fitted, log, used):
     cell = int(used[0])
     frames = np.concatenate(broken(log[:16], Fault(FaultKind.FLOATING, (cell,), value=1.0), fitted))
-    monitor = Monitor(fitted)
+    monitor = Monitor(fitted, wait=True)
     told = set[FaultKind]()
     for frame in frames:
         told |= {

@@ -73,7 +73,7 @@ def watched(
     diagnoser: SelfDiagnosis, frames: np.ndarray
 ) -> tuple[Monitor, list[tuple[int, Fault]]]:
     """Feed a log frame by frame; return the monitor and (frame, what it reported)."""
-    monitor = Monitor(diagnoser)
+    monitor = Monitor(diagnoser, wait=True)
     return monitor, told(monitor, frames)
 
 
@@ -117,7 +117,7 @@ def test_frame_by_frame_it_gives_the_diagnosis_of_all_frames(
 @pytest.mark.usefixtures("seldom_evaluated")
 def test_a_diagnosis_in_between_changes_nothing(fitted, log, middle):
     frames = inject(log, mixes(middle)["cells"], LAYOUT)
-    monitor = Monitor(fitted)
+    monitor = Monitor(fitted, wait=True)
     for i, frame in enumerate(frames):
         monitor.update(frame)
         if i % 222 == 50:
@@ -143,7 +143,7 @@ def test_a_flush_tells_at_once_what_diagnose_tells(fitted, log, middle):
 
 
 def test_a_flush_tells_what_a_log_shorter_than_a_segment_shows():
-    monitor = Monitor(COLD)
+    monitor = Monitor(COLD, wait=True)
     silent = np.ones((31, 220))
     silent[:, 7] = np.nan
     assert told(monitor, silent) == []
@@ -224,7 +224,7 @@ OTHER = Fault("drift", (7,))
     ],
 )
 def test_a_change_is_told_once_the_next_evaluation_confirms_it(evaluations, expected):
-    monitor = Monitor(COLD)
+    monitor = Monitor(COLD, wait=True)
     changes = [change for said in evaluations for change in monitor._changes(Said(*said))]
     assert ["gone" if fault.probability == 0 else fault for fault in changes] == expected
     said = {cell for fault in evaluations[-1] for cell in fault.cells}
@@ -235,7 +235,7 @@ def test_a_change_is_told_once_the_next_evaluation_confirms_it(evaluations, expe
 
 
 def test_frames_missing_according_to_the_clock_are_counted(fitted, log):
-    monitor = Monitor(fitted)
+    monitor = Monitor(fitted, wait=True)
     for i, frame in enumerate(log[:200]):
         if i not in (40, 41, 42, 150):
             monitor.update(frame, time=i / LAYOUT.rate)
@@ -246,7 +246,7 @@ def test_frames_missing_according_to_the_clock_are_counted(fitted, log):
 def test_a_clock_that_jitters_or_stops_or_runs_back_loses_no_frames(fitted, log):
     jitter = np.random.default_rng(0).uniform(-0.02, 0.02, 100)
     for times in (np.arange(100) / 10 + jitter, np.zeros(100), -np.arange(100) / 10):
-        monitor = Monitor(fitted)
+        monitor = Monitor(fitted, wait=True)
         for frame, time in zip(log[:100], times, strict=True):
             monitor.update(frame, time=float(time))
         assert monitor.diagnosis().transport == ()
@@ -255,8 +255,8 @@ def test_a_clock_that_jitters_or_stops_or_runs_back_loses_no_frames(fitted, log)
 def test_a_frame_may_be_a_grid_and_hold_missing_readings(fitted, log):
     frames = log[:100].copy()
     frames[::5, 7] = np.nan
-    flat = Monitor(fitted)
-    grid = Monitor(fitted)
+    flat = Monitor(fitted, wait=True)
+    grid = Monitor(fitted, wait=True)
     for frame in frames:
         flat.update(frame)
         grid.update(LAYOUT.grid(frame))
@@ -293,7 +293,7 @@ def test_a_frame_of_the_wrong_size_is_refused_with_both_sizes(size: int):
 
 
 def test_before_any_reading_there_is_nothing_to_diagnose():
-    monitor = Monitor(COLD)
+    monitor = Monitor(COLD, wait=True)
     with pytest.raises(ValueError, match="no frame with a reading"):
         monitor.diagnosis()
     monitor.update(np.full(220, np.nan))
@@ -306,8 +306,8 @@ def test_before_any_reading_there_is_nothing_to_diagnose():
 @pytest.mark.usefixtures("seldom_evaluated")
 def test_two_monitors_of_one_diagnoser_do_not_disturb_each_other(fitted, log, middle):
     broken = inject(log, [Fault("short", (middle[3],))], LAYOUT)
-    a = Monitor(fitted)
-    b = Monitor(fitted)
+    a = Monitor(fitted, wait=True)
+    b = Monitor(fitted, wait=True)
     for healthy_frame, broken_frame in zip(log[:400], broken[:400], strict=True):
         a.update(healthy_frame)
         b.update(broken_frame)
@@ -317,7 +317,7 @@ def test_two_monitors_of_one_diagnoser_do_not_disturb_each_other(fitted, log, mi
 
 def test_a_time_that_is_not_finite_is_refused_and_a_clock_that_is_set_loses_no_frames():
     layout = SensorLayout(1, 2, 3)
-    monitor = Monitor(SelfDiagnosis(layout))
+    monitor = Monitor(SelfDiagnosis(layout), wait=True)
     for time in (np.nan, np.inf, -np.inf):
         with pytest.raises(ValueError, match="expected seconds"):
             monitor.update(np.ones(6), time)
@@ -337,7 +337,7 @@ def test_a_copy_of_a_monitor_goes_on_as_the_monitor_does_and_apart_from_it(
     fitted, log, middle, duplicate
 ):
     broken = inject(log, [Fault("short", (middle[3],), onset=200)], LAYOUT)
-    monitor = Monitor(fitted)
+    monitor = Monitor(fitted, wait=True)
     told(monitor, broken[:140])
     twin = duplicate(monitor)  # while frames 0 to 127 are evaluated
     found = told(twin, broken[140:400])
@@ -362,10 +362,38 @@ def test_which_frame_tells_which_fault_does_not_depend_on_the_speed(
     assert watched(fitted, frames)[1] == changes != []
 
 
+def test_an_update_never_waits_for_an_evaluation(fitted, log, middle, monkeypatch, caplog):
+    frames = inject(log, mixes(middle)["cells"], LAYOUT, seed=0)[:600]
+    goes_on = threading.Event()
+    evaluate = SelfDiagnosis.evaluate
+
+    def held_up(self, stream, **given):
+        goes_on.wait(300)
+        return evaluate(self, stream, **given)
+
+    monkeypatch.setattr(SelfDiagnosis, "evaluate", held_up)
+    monitor = Monitor(fitted)
+    assert told(monitor, frames) == []  # or the test would not come here
+    assert [record.message[:30] for record in caplog.records] == ["frames come faster than they c"]
+    goes_on.set()
+    faults = {fault.cells for fault in monitor.flush()}
+    assert faults == {fault.cells for fault in fitted.diagnose(frames).faults} != set()
+
+
+def test_what_comes_late_is_told_by_a_later_update(fitted, log, middle):
+    frames = inject(log, mixes(middle)["cells"], LAYOUT, seed=0)
+    monitor = Monitor(fitted)
+    changes = told(monitor, frames[:400])
+    while not changes:
+        monitor._work.result(300)
+        changes = told(monitor, frames[:200])
+    assert all(fault.probability > 0 for _, fault in changes)
+
+
 def test_the_first_evaluation_is_there_after_frames_that_the_size_and_the_rate_state():
     for side, rate, first in ((4, 10.0, 48), (40, 40.0, 128)):  # 1.6 s are 64 frames
         layout = SensorLayout(1, side, side, rate=rate)
-        monitor = Monitor(SelfDiagnosis(layout))
+        monitor = Monitor(SelfDiagnosis(layout), wait=True)
         frames = np.random.default_rng(0).uniform(1, 2, (first, layout.n_cells))
         for frame in frames:
             assert monitor.evaluated is None
@@ -380,7 +408,7 @@ def test_what_an_evaluation_raises_reaches_an_update_and_its_frames_count_as_los
         raise MemoryError("no memory")
 
     broken = inject(log, [Fault("short", (middle[3],))], LAYOUT)
-    monitor = Monitor(fitted)
+    monitor = Monitor(fitted, wait=True)
     with monkeypatch.context() as patch:
         patch.setattr(SelfDiagnosis, "evaluate", fails)
         assert told(monitor, broken[:47]) == []
@@ -394,7 +422,7 @@ def test_what_an_evaluation_raises_reaches_an_update_and_its_frames_count_as_los
 
 def test_the_thread_of_a_monitor_ends_with_it(log):
     before = set(threading.enumerate())
-    monitor = Monitor(COLD)
+    monitor = Monitor(COLD, wait=True)
     told(monitor, log[:40])
     (thread,) = set(threading.enumerate()) - before
     del monitor
@@ -407,7 +435,7 @@ def test_the_thread_of_a_monitor_ends_with_it(log):
 @pytest.mark.filterwarnings("ignore:This process:DeprecationWarning")  # it has several threads
 def test_a_forked_process_goes_on_as_the_monitor_does(fitted, log, middle):
     broken = inject(log, [Fault("short", (middle[3],), onset=100)], LAYOUT)
-    monitor = Monitor(fitted)
+    monitor = Monitor(fitted, wait=True)
     told(monitor, broken[:130])  # 0 to 127 are evaluated
     reads, writes = os.pipe()
     child = os.fork()
@@ -429,7 +457,7 @@ import sys, threading
 import numpy as np
 from diagnostics import Monitor, SelfDiagnosis
 
-monitor = Monitor(SelfDiagnosis.load(sys.argv[1]))
+monitor = Monitor(SelfDiagnosis.load(sys.argv[1]), wait=True)
 
 def goes_on():
     threading.main_thread().join()

@@ -51,7 +51,7 @@ def test_dead_cells_without_contact_are_found_by_their_lack_of_noise_in_the_moni
     broken = [inject(r, faults, LAYOUT) for r in log]
     assert fitted.diagnose(broken).fault_set == dead.keys()
     diagnosis = fitted.diagnose(np.concatenate(broken))
-    monitor = Monitor(fitted)
+    monitor = Monitor(fitted, wait=True)
     for frame in np.concatenate(broken):
         monitor.update(frame)
     np.testing.assert_array_equal(monitor.diagnosis().probability, diagnosis.probability)

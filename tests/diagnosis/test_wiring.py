@@ -247,7 +247,7 @@ def test_the_monitor_names_the_group_and_the_wiring_is_stored(
     again = SelfDiagnosis.from_state(*fitted.state())
     assert again.layout == WIRED
     log = np.concatenate(silenced(grasps[1:12:2], BLOCKS["triangle 4"]))
-    monitor = Monitor(again)
+    monitor = Monitor(again, wait=True)
     told = [fault for frame in log for fault in monitor.update(frame)]
     assert str(told[0].line) == "triangle 4"
     assert monitor.diagnosis().faults == again.diagnose(log).faults

@@ -137,7 +137,7 @@ def test_a_short_without_any_contact_is_found_and_an_object_at_rest_there_is_no_
 def test_monitor_and_diagnosis_agree(fitted):
     fault = line_fault(SKIN, Line(0, "column", 9), FaultKind.SHORT, onset=40)
     frames = inject(log(SKIN, 200, 80), [fault], SKIN)
-    monitor = Monitor(fitted)
+    monitor = Monitor(fitted, wait=True)
     news = [fault for frame in frames for fault in monitor.update(frame)]
     assert any(n.line == fault.line for n in news)
     assert monitor.diagnosis().to_dict() == fitted.diagnose(frames).to_dict()

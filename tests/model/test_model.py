@@ -186,7 +186,7 @@ def test_a_stored_diagnosis_judges_bit_for_bit_as_before(fitted, tmp_path, healt
 def test_a_monitor_says_at_the_end_what_the_whole_log_says(fitted, healthy):
     for frames in healthy:
         frames[:, USED[0]] = 1500.0
-    monitor = Monitor(fitted)
+    monitor = Monitor(fitted, wait=True)
     for frame in np.concatenate(healthy):
         monitor.update(frame)
     assert {fault.cells for fault in monitor.faults} == {(USED[0],)}

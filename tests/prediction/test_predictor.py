@@ -95,7 +95,7 @@ def eager(monkeypatch) -> None:
 
 def running(carried: Carried, number: int = 1) -> Predictor:
     carried.deploy(number)
-    return Predictor(lambda: carried)
+    return Predictor(lambda: carried, wait=True)
 
 
 def spoil(carried: Carried, number: int) -> None:
@@ -172,7 +172,7 @@ def test_its_events_are_the_monitors(carried, fitted_small):
         np.concatenate([presses(60), presses(61)]), [Fault("short", (8,), onset=200)], SMALL
     )
     predictor = running(carried)
-    monitor = Monitor(fitted_small)
+    monitor = Monitor(fitted_small, wait=True)
     times = np.arange(len(frames)) / SMALL.rate
     readings = [predictor.stream(frame, t) for frame, t in zip(frames, times, strict=True)]
     said = [reading.events for reading in readings]

@@ -64,7 +64,7 @@ def test_functions_answer_alike_for_arrays_of_any_library(kind):
     )
     recordings = af.Recordings((given,), LAYOUT)
     np.testing.assert_array_equal(recordings.frames[0], FRAMES.astype(np.float32))
-    monitor = Monitor(fitted)
+    monitor = Monitor(fitted, wait=True)
     monitor.update(given.iloc[0] if kind is data_frame else kind(FRAMES[0]))
 
 

@@ -139,7 +139,7 @@ def test_a_little_noise_that_the_reference_did_not_have_is_no_fault(fitted):
 
 def test_a_monitor_takes_off_the_same(fitted):
     log = np.concatenate([r + 0.01 * i for i, r in enumerate(events(1, 3))])
-    monitor = Monitor(fitted)
+    monitor = Monitor(fitted, wait=True)
     for frame in log:
         monitor.update(frame)
     np.testing.assert_array_equal(monitor.diagnosis().probability, fitted.diagnose(log).probability)

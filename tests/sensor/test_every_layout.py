@@ -214,7 +214,7 @@ def test_every_call_of_the_diagnosis_ends_well_with_a_reference_and_without(layo
                 assert sorted(found.source.tolist()) == list(range(layout.n_cells))
                 assert layout.is_matrix or layout.pads > 1
         assert again.diagnose(log).to_dict() == diagnosis.to_dict()
-    monitor = Monitor(fitted)
+    monitor = Monitor(fitted, wait=True)
     for frame in broken[0]:
         monitor.update(frame)
     assert monitor.diagnosis().fault_set == fitted.diagnose(broken[0]).fault_set

@@ -40,7 +40,7 @@ def test_a_diagnosis_is_the_same(flat_fit, given):
     assert diagnoser.diagnose(np.reshape(broken, given.shape)).to_dict() == wanted
     alone = diagnoser.diagnose(broken[0].reshape(given.shape[1:]))
     assert (alone.n_recordings, alone.n_frames) == (1, 40)
-    monitor = Monitor(diagnoser)
+    monitor = Monitor(diagnoser, wait=True)
     for frame in given[0]:
         monitor.update(frame)
     assert monitor.diagnosis().n_frames == 40

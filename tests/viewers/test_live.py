@@ -89,7 +89,7 @@ def shorted() -> np.ndarray:
 
 def fed(view: LiveView, values: np.ndarray, start: int = 0, session: Session | None = None):
     """Show frames of device "a" at 10 Hz."""
-    session = session or Session("a", Monitor(SelfDiagnosis(view.layout)))
+    session = session or Session("a", Monitor(SelfDiagnosis(view.layout), wait=True))
     for i, values_ in enumerate(np.asarray(values, dtype=np.float64), start):
         frame = Frame("a", i / 10, values_)
         view.take(frame, session, session.take(frame, i / 10))
@@ -186,7 +186,7 @@ def test_with_a_bundle_restored_frames_stand_beside_those_that_came(ending, made
     view = LiveView(str(path), bundle.layout, lambda: FrameRepair(restorer, known))
     values = np.random.default_rng(1).uniform(0, 5, (12, 60))
     values[:, 7] = np.nan
-    fed(view, values, session=Session("a", Monitor(SelfDiagnosis(bundle.layout))))
+    fed(view, values, session=Session("a", Monitor(SelfDiagnosis(bundle.layout), wait=True)))
     view.close()
     repair = FrameRepair(restorer, known)
     whole = np.array([repair(frame)[0] for frame in values])

@@ -59,7 +59,7 @@ class Watch:
         self.sensor = sensor
         self.layout = sensor.layout
         self.faulty = np.zeros(self.layout.n_cells, bool)  # as the monitor finds
-        self.monitor = Monitor(sensor.diagnoser)
+        self.monitor = Monitor(sensor.diagnoser, wait=True)
         self.read_out: ReadOut | None = None  # what the last scan says
         self._scans = Scans(self.layout, lines_held)
         self._changing = threading.Lock()  # held for moments, never while a frame is monitored
@@ -86,7 +86,7 @@ class Watch:
         repair = self._repair_of(sensor)
         # the frames so far read otherwise
         other = before.parts != sensor.parts or before.readings != sensor.readings
-        monitor = Monitor(sensor.diagnoser) if other else self.monitor
+        monitor = Monitor(sensor.diagnoser, wait=True) if other else self.monitor
         with self._changing:
             if other:
                 self.faulty[:] = False

@@ -13,7 +13,6 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_factor, cho_solve
 from scipy.linalg.lapack import dpotrf, dpotri
 
 from diagnostics.events.tiles import tiles
@@ -109,10 +108,8 @@ class Tile:
         scale = np.where(np.isinf(self.deviation), 0, self.deviation)[self.place]
         weight = self.covariance[np.ix_(two, self.place)] @ (chosen[lines] * scale).T
         explained = precision @ weight
-        for k, line in enumerate(lines.tolist()):
-            own = np.flatnonzero(np.tile(on[line, self.inputs], 2)[two])
-            block = cho_factor(precision[np.ix_(own, own)])
-            weight[own, k] -= cho_solve(block, explained[own, k])
+        off = _solved(precision, np.tile(on[np.ix_(lines, self.inputs)], 2)[:, two], explained.T)
+        weight -= off.T
         total[:, lines] += z[:, two] @ (precision @ weight)
         return total
 
@@ -142,6 +139,26 @@ def _inverse(covariance: Floats) -> Floats:
     lower: Floats = np.tril(half)
     lower += np.tril(half, -1).T
     return lower
+
+
+def _solved(matrix: Floats, own: Mask, values: Floats) -> Floats:
+    """Return the solution x of ``matrix[own, own] x[own] = values[own]`` for each of several parts,
+    ``[W, n]``; 0 elsewhere.
+
+    Args:
+        matrix: ``[n, n]``.
+        own: bool ``[W, n]``.
+        values: ``[W, n]``.
+    """
+    found = np.zeros(own.shape)
+    sizes = own.sum(axis=1)
+    for size in np.unique(sizes[sizes > 0]).tolist():
+        alike = np.flatnonzero(sizes == size)
+        at = np.nonzero(own[alike])[1].reshape(-1, size)
+        blocks = matrix[at[:, :, None], at[:, None, :]]
+        given = np.take_along_axis(values[alike], at, 1)
+        found[alike[:, None], at] = np.linalg.solve(blocks, given[..., None])[..., 0]
+    return found
 
 
 def _left_out(y: Floats, precision: Floats) -> Floats:

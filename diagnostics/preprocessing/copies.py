@@ -200,14 +200,19 @@ def _same(
         return False
     a = one[begin:end]
     b = other[begin + shift : end + shift]
-    moving = np.maximum(np.ptp(a, axis=0), np.ptp(b, axis=0)) > _LOADED * tolerance
-    loaded = np.maximum(np.abs(a), np.abs(b))[:, moving] > _LOADED * tolerance
+    range_a = np.ptp(a, axis=0)
+    moving = np.maximum(range_a, np.ptp(b, axis=0)) > _LOADED * tolerance
+    a = a[:, moving]
+    b = b[:, moving]
+    # one frame of full scale, which is corrupt, would be all that moves
+    difference = _without_odd(np.square(a - b))
+    most = _DIFFERS_SHORT if end - begin < _SHORT else _DIFFERS
+    if difference > most**2 * float(np.square(range_a[moving]).sum()):
+        return False  # more than any recording of this range moves: most pairs end here
+    loaded = np.maximum(np.abs(a), np.abs(b)) > _LOADED * tolerance
     if loaded.sum() < _FEWEST or loaded.any(axis=1).sum() < _FRAMES:
         return False
-    # one frame of full scale, which is corrupt, would be all that moves
-    usual = _without_odd(np.square(a - np.median(a, axis=0))[:, moving])
-    difference = _without_odd(np.square(a - b)[:, moving])
-    most = _DIFFERS_SHORT if end - begin < _SHORT else _DIFFERS
+    usual = _without_odd(np.square(a - np.median(a, axis=0)))
     return difference <= most**2 * usual
 
 

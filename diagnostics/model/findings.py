@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -84,6 +85,67 @@ def _reads_the_same_loads(alias: Fault, log: Log) -> bool:
     return bool(alone > _ALONE * moves)
 
 
+@dataclass(frozen=True)
+class _Blamed:
+    """Who is faulty, and by what, bool ``[D]`` each.
+
+    Attributes:
+        delivers, silent: cells with readings, and those without.
+        known: cells that were dead in the reference already, and have not moved since.
+        blinks, noisy: told by single frames.
+        on_line: cells of lines that fail as a whole.
+        faulty: all of these, and what the pieces of the log tell.
+        probability: float, that it is.
+    """
+
+    delivers: Mask
+    silent: Mask
+    known: Mask
+    blinks: Mask
+    noisy: Mask
+    on_line: Mask
+    faulty: Mask
+    probability: Floats
+
+    @property
+    def by_frames(self) -> Mask:
+        """Told by single frames."""
+        return self.blinks | self.noisy
+
+    @property
+    def by_pieces(self) -> Mask:
+        """Told by the pieces of the log."""
+        return self.faulty & ~self.silent & ~self.by_frames & ~self.known
+
+
+def _blamed(judgement: Judgement, stream: StreamState, rate: float) -> _Blamed:
+    """Return who is faulty; arguments as of :func:`findings`."""
+    log = judgement.observed.log
+    disturbed = judgement.disturbed
+    silent = stream.silent & stream.present
+    delivers = log.received & ~silent
+    probability = np.where(delivers, judgement.probability, np.where(silent, 1.0, 0.0))
+    # how many others are faulty makes none faulty that shows no more than a healthy one
+    faulty = faulty_at(np.where(silent, 0.0, probability), rate) & (judgement.log_odds > 0)
+    known = delivers & (stream.reference.dead > 0) & ~stream.runs.moved
+    probability[known] = stream.reference.dead[known]
+    faulty = (delivers & faulty | known) & (~disturbed | (log.run >= HELD))
+    unknown = delivers & disturbed & ~faulty
+    probability = np.where(unknown, np.minimum(probability, 0.5), probability)
+    on_line = delivers & judgement.failing.cells & ~disturbed
+    # a line that fails as a whole explains what its cells do
+    told = delivers & ~disturbed & ~on_line
+    frames = stream.intermittency
+    noisy = frames.excess & told
+    blinks = frames.intermittent & told
+    if log.step:  # of a coarser converter: loads come and go in one
+        blinks = np.zeros_like(blinks)
+    probability = np.where(blinks | noisy, 1 - RARE, probability)
+    probability = np.where(on_line, judgement.failing.probability, probability)
+    faulty = faulty | silent | blinks | noisy | on_line
+    return _Blamed(delivers, silent, known, blinks, noisy, on_line, faulty, probability)
+
+
 def findings(
     judgement: Judgement, stream: StreamState, full_scale: float, rate: float
 ) -> CellFindings:
@@ -97,95 +159,77 @@ def findings(
         rate: expected share of healthy cells among those that are faulty.
     """
     log = judgement.observed.log
-    rest = log.symbols.rest
-    present = stream.present
-    silent = stream.silent & present
-    delivers = log.received & ~silent
-    probability = np.where(delivers, judgement.probability, np.where(silent, 1.0, 0.0))
-    # how many others are faulty makes none faulty that shows no more than a healthy one
-    faulty = faulty_at(np.where(silent, 0.0, probability), rate) & (judgement.log_odds > 0)
-    faulty &= delivers
-    # dead in the reference already, and has not moved since
-    known = delivers & (stream.reference.dead > 0) & ~stream.runs.moved
-    probability[known] = stream.reference.dead[known]
-    faulty |= known
-    frames = stream.intermittency
-    blinks = frames.intermittent & delivers
-    noisy = frames.excess & delivers
-    if log.step:  # of a coarser converter: loads come and go in one
-        blinks = np.zeros_like(blinks)
-    disturbed = judgement.disturbed
-    faulty &= ~disturbed | (log.run >= HELD)
-    unknown = delivers & disturbed & ~faulty
-    probability = np.where(unknown, np.minimum(probability, 0.5), probability)
-    blinks &= ~disturbed
-    noisy &= ~disturbed
-    # a line that fails as a whole explains what its cells do
     failing = judgement.failing
-    on_line = delivers & failing.cells & ~disturbed
-    blinks &= ~on_line
-    noisy &= ~on_line
-    by_frames = blinks | noisy
-    probability = np.where(by_frames, 1 - RARE, probability)
-    probability = np.where(on_line, failing.probability, probability)
-    faulty = faulty | silent | by_frames | on_line
-    way = np.where(on_line, WAYS.index(COMES_AND_GOES), judgement.way)
-    kind = _kinds()[way]
-    by_pieces = faulty & ~silent & ~by_frames & ~known
-    refuted = np.where(by_pieces, kind, -1)
-    value = log.value.astype(np.float64)
+    frames = stream.intermittency
+    blamed = _blamed(judgement, stream, rate)
+    way = np.where(blamed.on_line, WAYS.index(COMES_AND_GOES), judgement.way)
+    refuted = np.where(blamed.by_pieces, _kinds()[way], -1)
+    drifts = blamed.by_pieces & (way == WAYS.index(DRIFTS))
     # what never left its rest agrees with a broken line, whatever is likeliest of it
-    drifts = by_pieces & (way == WAYS.index(DRIFTS))
     to_end = log.run >= min(HELD, len(log.record))
-    holds = delivers & (faulty | to_end) & (refuted < 0) & ~by_frames & ~drifts
-    # where a cell rests that was dead already, the reference does not show
-    level = np.where(stream.reference.dead > 0, stream.reference.scale.baseline, rest.level)
-    # below its rest a cell is cut off as well
-    rests = holds & (value - level <= rest.near + log.symbols.tolerance)
-    reading = stream.reading(value)
+    holds = blamed.delivers & (blamed.faulty | to_end) & (refuted < 0)
+    holds &= ~blamed.by_frames & ~drifts
+    rests = holds & _below_or_at_rest(log, stream)
+    reading = stream.reading(log.value.astype(np.float64))
     beyond = holds & ~rests
-    top = full_scale - log.symbols.tolerance
-    # not certain one by one: the cells of a line that fails now and then fail together
-    comes_and_goes = (kind >= 0) & (kind < len(OF_WIRES))
-    likely = (judgement.evidence.max(axis=0) > 0) & ~shown(judgement)
-    unsure = delivers & log.far & ~faulty & comes_and_goes & likely & ~disturbed
+    tolerance = log.symbols.tolerance
     told = _value(judgement, np.where(refuted >= 0, way, -1), stream, reading)
-    weak = refuted == REFUTED_KINDS.index(FaultKind.WEAK)
-    gain = np.where(weak, told, np.nan)
+    gain = np.where(refuted == REFUTED_KINDS.index(FaultKind.WEAK), told, np.nan)
     reads_more = gain > 1
     typical = stream.typical_reading()
     return CellFindings(
-        faulty=faulty,
+        faulty=blamed.faulty,
         # how many others are faulty makes no wire of those that move
-        alive=delivers & log.far & ~faulty & (expit(judgement.log_odds) < DOUBTED),
-        silent=silent,
+        alive=blamed.delivers & log.far & ~blamed.faulty & (expit(judgement.log_odds) < DOUBTED),
+        silent=blamed.silent,
         rests=rests,
-        full=beyond & (reading >= top),
-        zero=None if stream.load is None else beyond & (reading <= log.symbols.tolerance),
-        intermittent=blinks,
-        noisy=noisy,
+        full=beyond & (reading >= full_scale - tolerance),
+        zero=None if stream.load is None else beyond & (reading <= tolerance),
+        intermittent=blamed.blinks,
+        noisy=blamed.noisy,
         drifting=reads_more | drifts,
         gain=gain,
-        value=np.where(blinks, stream.blinks_to(full_scale), told),
+        value=np.where(blamed.blinks, stream.blinks_to(full_scale), told),
         since=np.select(
-            [silent, blinks, noisy],
+            [blamed.silent, blamed.blinks, blamed.noisy],
             [stream.runs.missed_since, frames.blinks_since, frames.noisy_since],
-            _since(judgement, way, on_line),
+            _since(judgement, way, blamed.on_line),
         ),
-        probability=probability,
-        weight=np.where(known, CERTAIN_RATIO, _weight(judgement, holds)),
+        probability=blamed.probability,
+        weight=np.where(blamed.known, CERTAIN_RATIO, _weight(judgement, holds)),
         events=np.select(
-            [blinks, on_line], [frames.blinks, failing.units], len(judgement.units.begins)
+            [blamed.blinks, blamed.on_line],
+            [frames.blinks, failing.units],
+            len(judgement.units.begins),
         ),
-        known=known,
+        known=blamed.known,
         refuted=np.where(reads_more, -1, refuted),
-        unsure=np.where(unsure, kind, -1),
-        wire=np.where(on_line, failing.line, -1),
+        unsure=_unsure(judgement, blamed, _kinds()[way]),
+        wire=np.where(blamed.on_line, failing.line, -1),
         of_wire=failing.probability,
         share=failing.share,
         as_one=failing.as_one,
-        typical=np.where(np.abs(typical - reading) <= 2 * log.symbols.tolerance, typical, reading),
+        typical=np.where(np.abs(typical - reading) <= 2 * tolerance, typical, reading),
     )
+
+
+def _below_or_at_rest(log: Log, stream: StreamState) -> Mask:
+    """Return the cells that hold a value at their rest, or below it, bool ``[D]``: there a cell is
+    cut off as well."""
+    rest = log.symbols.rest
+    # where a cell rests that was dead already, the reference does not show
+    level = np.where(stream.reference.dead > 0, stream.reference.scale.baseline, rest.level)
+    found: Mask = log.value - level <= rest.near + log.symbols.tolerance
+    return found
+
+
+def _unsure(judgement: Judgement, blamed: _Blamed, kind: NDArray[np.intp]) -> NDArray[np.intp]:
+    """Return the ``kind`` (int ``[D]``) of cells that are not certain one by one; -1: none. The
+    cells of a line that fails now and then fail together."""
+    comes_and_goes = (kind >= 0) & (kind < len(OF_WIRES))
+    likely = (judgement.evidence.max(axis=0) > 0) & ~shown(judgement)
+    moves = blamed.delivers & judgement.observed.log.far & ~judgement.disturbed
+    return np.where(moves & ~blamed.faulty & comes_and_goes & likely, kind, -1)
 
 
 def shown(judgement: Judgement) -> Mask:

@@ -90,6 +90,28 @@ class _Reference:
     fold: Cells
     means: Sequence[ConditionalMean]
 
+    @classmethod
+    def of(
+        cls,
+        recordings: Recordings,
+        record: Record,
+        symbols: Symbols,
+        layout: SensorLayout,
+        living: Mask,
+        rng: np.random.Generator,
+    ) -> _Reference:
+        """Return the recordings as symbols, in folds."""
+        rest = symbols.rest
+        above = rest.above(record, rest.shared(record, living).offset)
+        load = root_load(above, rest)
+        level = symbols.levels(record, above, np.zeros(above.shape, bool))
+        fold = rng.permutation(len(recordings)) % min(_FOLDS, len(recordings))
+        of_piece = fold[record.recording]
+        means = [
+            ConditionalMean.fit(load[of_piece != k], layout, living) for k in range(fold.max() + 1)
+        ]
+        return cls(recordings, record, load, level, symbols.flat(record), living, fold, means)
+
     @property
     def of_piece(self) -> Cells:
         """Fold of each piece, int ``[n]``."""
@@ -128,36 +150,26 @@ def fit_model(
     longest = max(map(len, recordings))
     recordings = _enough([np.asarray(one, np.float32) for one in recordings])
     present = layout.present.ravel()
-    full = float(layout.full_scale)
     length = frames_of_piece(recordings)
     record = record_of(recordings, length)
     ranges = np.fmax.reduce(record.high) - np.fmin.reduce(record.low)
-    living = present & ~dead & (ranges > _LIVES * full)
+    living = present & ~dead & (ranges > _LIVES * layout.full_scale)
     if len(recordings) < FEWEST or not living.any():
         return None
-    rest = fit_rest(record, full, converter_step(recordings, layout), layout.pad_of, living)
-    above = rest.above(record, rest.shared(record, living).offset)
-    symbols = Symbols.fit(above, rest, living)
-    load = root_load(above, rest)
-    level = symbols.levels(record, above, np.zeros(above.shape, bool))
-    flat = symbols.flat(record)
-    fold = rng.permutation(len(recordings)) % min(_FOLDS, len(recordings))
-    means = [
-        ConditionalMean.fit(load[fold[record.recording] != k], layout, living)
-        for k in range(fold.max() + 1)
-    ]
-    reference = _Reference(recordings, record, load, level, flat, living, fold, means)
+    symbols = _symbols_of(recordings, record, layout, living)
+    reference = _Reference.of(recordings, record, symbols, layout, living, rng)
+    load = reference.load
     whole = ConditionalMean.fit(load, layout, living)
     progress(0.1)
     predictor = Predictor.of(load, layout, living, whole)
     examples = _examples(predictor, reference, rng)
     network = Network.fit(*_together(examples), symbols.n)
     progress(0.4)
-    cross_fitted = CrossFitted.of(means, reference.of_piece)
+    cross_fitted = CrossFitted.of(reference.means, reference.of_piece)
     half = reference.of_piece % _HALVES
     lines, resting = fit_lines(layout, living, cross_fitted, load, record, half)
     tolerance = tolerance_of([np.asarray(one, float) for one in recordings], layout)
-    as_one = as_one_of(layout, living, symbols, flat, tolerance)
+    as_one = as_one_of(layout, living, symbols, reference.flat, tolerance)
     if len(as_one.on):
         record = record_of(recordings, length, as_one)
         reference = replace(reference, record=record)
@@ -173,12 +185,23 @@ def fit_model(
     model.lines = replace(model.lines, odd=_odd_lines(model.lines, observed))
     progress(1 - _OF_LOGS)
     _judge_logs(model, reference, held_out, rng, progress)
-    model.lines = replace(model.lines, resting=lines.resting, half=NO_HALF)
-    model.groups = replace(model.groups, chain=groups.chain, half=NO_HALF)
-    predictor.mean = whole
-    predictor.network = network
-    model.flatness = flatness
-    return model
+    return replace(
+        model,
+        lines=replace(model.lines, resting=lines.resting, half=NO_HALF),
+        groups=replace(model.groups, chain=groups.chain, half=NO_HALF),
+        predictor=replace(predictor, mean=whole, network=network),
+        flatness=flatness,
+    )
+
+
+def _symbols_of(
+    recordings: Recordings, record: Record, layout: SensorLayout, living: Mask
+) -> Symbols:
+    """Return the symbols of the reference."""
+    step = converter_step(recordings, layout)
+    rest = fit_rest(record, float(layout.full_scale), step, layout.pad_of, living)
+    above = rest.above(record, rest.shared(record, living).offset)
+    return Symbols.fit(above, rest, living)
 
 
 def _enough(recordings: list[Array]) -> list[Array]:

@@ -43,15 +43,10 @@ class Log:
         disturbed: bool ``[D]``, cells of pads that share what the reference never saw: an offset, a
             drift, noise, coarse steps, or a top that loads reach.
         saturated: whether any load may read as the top.
-        overloaded: bool ``[D]``, cells that end there, having moved.
         step: of the converter, where it is coarser than that of the reference; else 0.
-        load: root loads ``[n, D]``.
-        level, flat, before: int ``[n, D]``.
-        agree: log P(two readings of this level agree) ``[n, D]``.
         either: int8 ``[shifts, n, D]``, levels that a reading may have: near an edge, either.
         value: ``[D]``, reading at the end, of the pieces that agree with the last one.
         holds: bool ``[n, D]``, pieces at this value.
-        run: int ``[D]``, of them, up to the end.
     """
 
     def __init__(self, record: Record, symbols: Symbols, present: Mask, living: Mask) -> None:
@@ -82,7 +77,6 @@ class Log:
         low = np.where(saturates, top, self.value - symbols.tolerance)
         high = np.where(saturates, np.inf, self.value + symbols.tolerance)
         self.holds = (record.low >= low) & (record.high <= high)
-        self.load = root_load(self.above, rest)
         doubt = np.where(wider, unsure, rest.near / 2)
         shifts = [np.zeros_like(doubt), -doubt, doubt]
         if wider.any():
@@ -90,15 +84,47 @@ class Log:
         self.either = np.stack(
             [symbols.levels(record, self.above + shift, self.holds) for shift in shifts]
         )
-        self.level: NDArray[np.int8] = self.either[0]
-        self.agree = np.log(symbols.agree(self.step))[self.level]
-        self.flat = symbols.flat(record)
-        self.before = before_of(self.flat, record)
         self._alone: Array | None = None
-        ends_at_top = self.level[-1] == symbols.top
-        self.overloaded: Mask = self.far & ends_at_top & self.saturated
+
+    @cached_property
+    def load(self) -> Array:
+        """Root loads ``[n, D]``."""
+        return root_load(self.above, self.symbols.rest)
+
+    @property
+    def level(self) -> NDArray[np.int8]:
+        """Level of each piece, ``[n, D]``."""
+        found: NDArray[np.int8] = self.either[0]
+        return found
+
+    @cached_property
+    def agree(self) -> Array:
+        """Log P(two readings of the level of each piece agree), ``[n, D]``."""
+        found: Array = np.log(self.symbols.agree(self.step))[self.level]
+        return found
+
+    @cached_property
+    def flat(self) -> NDArray[np.int8]:
+        """How flat each piece is, ``[n, D]``."""
+        return self.symbols.flat(self.record)
+
+    @cached_property
+    def before(self) -> NDArray[np.int8]:
+        """How flat the piece before each one is, ``[n, D]``."""
+        return before_of(self.flat, self.record)
+
+    @cached_property
+    def run(self) -> NDArray[np.intp]:
+        """Number of pieces at the value of the end, up to the end, ``[D]``."""
         at_end = np.logical_and.accumulate(np.flip(self.holds, 0), 0)
-        self.run = at_end.sum(axis=0)
+        found: NDArray[np.intp] = at_end.sum(axis=0)
+        return found
+
+    @property
+    def overloaded(self) -> Mask:
+        """Cells that move and end at a top that any load may reach, bool ``[D]``."""
+        found: Mask = self.far & (self.level[-1] == self.symbols.top) & self.saturated
+        return found
 
     @property
     def is_coarse(self) -> bool:

@@ -236,15 +236,18 @@ class Recorder:
         fresh = self._fresh(frames, previous) | begins
         cut, changes = self._cuts(frames, previous)
         age = since_begin(begins) + np.where(begins.cumsum() == 0, self.age, 0)
-        cut &= age >= self.longest
-        age_after = int(age[-1]) + 1
-        given = frames[-1].copy()
-        frames = frames[fresh]
-        numbers = numbers[fresh]
-        begins = begins[fresh]
-        if not len(frames):
-            return replace(self, changes=changes, age=age_after)
-        cut = cut[fresh] & ~begins
+        cut &= (age >= self.longest) & ~begins
+        after = replace(self, changes=changes, age=int(age[-1]) + 1)
+        if not fresh.any():
+            return after
+        after = replace(after, given=frames[-1].copy())
+        return after._joined(frames[fresh], numbers[fresh], begins[fresh], cut[fresh])
+
+    def _joined(
+        self, frames: NDArray[np.floating], numbers: Cells, begins: Mask, cut: Mask
+    ) -> Recorder:
+        """Return the recorder with the pieces of fresh frames; arguments as of :meth:`extend`, and
+        ``cut``, bool ``[t]``: frames with which joined recordings begin."""
         if self.as_one is not None:
             frames = np.hstack([frames, self.as_one(frames)])
         open_frames = 0
@@ -260,14 +263,11 @@ class Recorder:
         continues = not starts[0]
         if continues:
             first = np.insert(first, 0, 0)
-        new = _pieces(frames, numbers, first)
-        new = replace(
-            new, recording=self.recordings - 1 + np.cumsum(begins[first]), first=opens[first]
-        )
-        run = new
+        recording = self.recordings - 1 + np.cumsum(begins[first])
+        run = _pieces(frames, numbers, first, recording, opens[first])
         before = 0
         if self.last is not None:
-            run = _Pieces.joined([self.last, new])
+            run = _Pieces.joined([self.last, run])
             before = len(self.last)
         joins = np.zeros(len(run), bool)
         joins[before] = continues
@@ -280,9 +280,6 @@ class Recorder:
             complete=self._fewer(kept),
             last=run.chosen(slice(-2, None)),
             recordings=self.recordings + int(begins[first].sum()),
-            given=given,
-            changes=changes,
-            age=age_after,
         )
 
     def _before(self, frames: NDArray[np.floating]) -> NDArray[np.floating]:
@@ -366,20 +363,28 @@ def record_of(
     return recorder.record(frame)
 
 
-def _pieces(frames: NDArray[np.floating], numbers: Cells, first: Cells) -> _Pieces:
-    """Return the pieces of frames ``[t, D]``; ``first``: int ``[n]``, index of the first one of
-    each."""
+def _pieces(
+    frames: NDArray[np.floating], numbers: Cells, first: Cells, recording: Cells, opens: Mask
+) -> _Pieces:
+    """Return the pieces of frames ``[t, D]``.
+
+    Args:
+        frames: NaN: missing.
+        numbers: int ``[t]``, of the frames.
+        first: int ``[n]``, index of the first one of each piece.
+        recording, opens: of each piece, and whether a recording begins with it, ``[n]``.
+    """
     x = frames.astype(np.float32)
     missing = np.isnan(x)
     return _Pieces(
-        np.fmin.reduceat(x, first, axis=0),
-        np.fmax.reduceat(x, first, axis=0),
-        np.add.reduceat(np.where(missing, 0, x), first, axis=0, dtype=np.float64),
-        np.add.reduceat(~missing, first, axis=0, dtype=np.int32),
-        np.diff(np.append(first, len(x))),
-        np.zeros_like(first),
-        np.zeros(len(first), bool),
-        numbers[first],
+        low=np.fmin.reduceat(x, first, axis=0),
+        high=np.fmax.reduceat(x, first, axis=0),
+        total=np.add.reduceat(np.where(missing, 0, x), first, axis=0, dtype=np.float64),
+        count=np.add.reduceat(~missing, first, axis=0, dtype=np.int32),
+        frames=np.diff(np.append(first, len(x))),
+        recording=recording,
+        first=opens,
+        begins=numbers[first],
     )
 
 

@@ -27,18 +27,24 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
 from scipy.ndimage import median_filter
 
+from diagnostics.model.middles import (
+    AROUND,
+    EVEN,
+    NOISES,
+    agreed,
+    around,
+    even,
+    shortest,
+    throughout,
+)
 from diagnostics.model.record import Array, Cells, Mask, Record, since_begin
 from diagnostics.preprocessing.quantiles import known_quantile
 
 NARROW = 0.002  # of full scale: readings differ by it without a load
 DITHER = 0.01  # of full scale: a stuck value with the dither of its converter
 _FEWEST = 6  # cells of a pad that tell what it shares
-_EVEN = 0.5  # of an offset: by which the cells that share it differ
-_HALF = 0.25  # of a positive one, which a contact is as well; and by no more than some noises
-_NOISES = 3.0
 _SETTLES = 0.75  # of the recordings
 _RESTS = 0.25  # share of the recordings in which a cell rests at some time, at least
 _WIDER = 8.0  # than their interval is the spread of all, where these rest and others do not
@@ -47,7 +53,6 @@ _ROUNDS = 3
 _SURE = 20.0  # pieces that a share of 1 is worth
 _MOST = 2.0  # share of the offset of a pad that a cell shows in a log; in the reference 1
 _BLOCK = 64  # pieces of a recording that are looked at as one
-_AROUND = 7  # blocks that tell where a cell rests, at least
 _MEDIAN = 5  # of them, those that tell where its pad does
 _QUIET = 0.1  # quantile of the changes between two pieces: a cell that no load moves
 _QUIETEST = 0.25  # of the cells of a pad: noise is what all have
@@ -154,7 +159,7 @@ class Rest:
         at_end = at_top | ((record.high <= 0) & (self.level > self.near))
         for pad in np.unique(self.pad).tolist():
             cells = self.pad == pad
-            tell = np.flatnonzero(cells & telling & (self.share > _EVEN))
+            tell = np.flatnonzero(cells & telling & (self.share > EVEN))
             live = tell[~stuck[tell]]
             if 2 * len(live) > len(tell):
                 tell = live
@@ -162,21 +167,21 @@ class Rest:
                 continue
             alike = above[:, tell]
             if share is not None:  # of a usual cell's: else all shrink, and what they are of grows
-                alike = alike * np.median(share[tell]) / np.maximum(share[tell], _EVEN)
+                alike = alike * np.median(share[tell]) / np.maximum(share[tell], EVEN)
             of_pad = np.sort(np.where(at_end[:, tell], np.nan, alike), axis=1)
             noise = float(np.median(self.near[tell]))
             finest = max(self.least, min(noise, float(np.median(self.noise[tell]))))
-            middle, weight, surely = _even(of_pad, noise, finest)
-            around = _around(middle, weight >= 1, record)
+            middle, weight, surely = even(of_pad, noise, finest)
+            beside = around(middle, weight >= 1, record)
             # no load is negative: in a contact with most of a pad that sags, the lowest tell
             lowest = of_pad[:, : len(tell) // 2 + 1]
             if lowest.shape[1] > _FEWEST:
-                of_lowest, even, _ = _even(lowest, noise / 2, noise / 2)
-                around = np.where((of_lowest < 0) & (even > 0), even * of_lowest, around)
-            shared = weight * middle + (1 - weight) * around
+                of_lowest, sunk, _ = even(lowest, noise / 2, noise / 2)
+                beside = np.where((of_lowest < 0) & (sunk > 0), sunk * of_lowest, beside)
+            shared = weight * middle + (1 - weight) * beside
             if self.pressed[cells].any():
-                throughout = _throughout(middle, weight >= 1, record)
-                shared = np.minimum(shared, np.maximum(throughout, surely * middle))
+                lasts = throughout(middle, weight >= 1, record)
+                shared = np.minimum(shared, np.maximum(lasts, surely * middle))
             found[:, cells] = shared[:, None]
         return found
 
@@ -190,7 +195,7 @@ class Rest:
         """
         found = np.zeros(record.mean.shape, np.float32)
         first = _blocks(record)
-        if len(first) < _AROUND:
+        if len(first) < AROUND:
             return found
         above = record.mean - self.level
         # what stays at an end of the converter is no rest
@@ -207,13 +212,13 @@ class Rest:
             near = self.near[cells]
             middle = median_filter(np.median(low[:, tell], axis=1), _MEDIAN, mode="nearest")
             shared = middle[:, None]
-            own, agree = _usual(low - shared, _NOISES * near)
+            own, agree = agreed(low - shared, NOISES * near)
             apart = np.median(np.abs(own[:, tell]), axis=1, keepdims=True)
-            usual = np.abs(own) <= _NOISES * (apart + near)
+            usual = np.abs(own) <= NOISES * (apart + near)
             agree &= usual | (np.abs(shared + own) <= near)  # as the others, or not at all
             rests = shared + np.where(agree, own, 0)
             beyond = np.abs(rests) > np.maximum(near, _NOISIER * self.drifts[cells])
-            displaced = (agree & beyond)[:, tell].mean(axis=1) > _EVEN
+            displaced = (agree & beyond)[:, tell].mean(axis=1) > EVEN
             of_block[np.ix_(displaced, cells)] = rests[displaced]
         pieces = np.diff(np.append(first, len(record)))
         found[:] = np.repeat(of_block, pieces, axis=0)
@@ -232,7 +237,7 @@ class Rest:
         its pad shares, ``[n, D]`` each. Cells that share less than others read more, those that
         share more no less; none rests below 0."""
         above = record.mean - np.maximum(self.level + offset, 0)
-        uneven = _EVEN * np.maximum(-offset, 0)
+        uneven = EVEN * np.maximum(-offset, 0)
         found: Array = np.where(above < 0, np.minimum(above + uneven, 0), above)
         return found
 
@@ -303,7 +308,7 @@ class Rest:
 def _change(drift: Array, record: Record) -> Array:
     """Return by how much each cell drifts while its pad is told anew, ``[D]`` of ``[n, D]``."""
     of_block = drift[_blocks(record)]
-    later = _AROUND // 2
+    later = AROUND // 2
     found: Array = np.abs(of_block[later:] - of_block[:-later]).max(axis=0, initial=0)
     return found
 
@@ -411,81 +416,6 @@ def _lowest(readings: Array, first: Cells, least: float) -> tuple[Array, Array]:
     return level, np.select([some, few], [_WIDER * width, of_few], spread).astype(np.float32)
 
 
-def _even(above: Array, noise: float, finest: float) -> tuple[Array, Array, Array]:
-    """Return the middle of what half of the cells of a pad, at least, read alike, how surely they
-    share it, and how surely no contact is as even: within the ``finest`` noise, ``[n]`` each;
-    ``above``: ``[n, k]`` in ascending order."""
-    middle, width = shortest(above, 0.5)
-    below = np.maximum(noise, _EVEN * -middle)
-    most = np.clip(_HALF * middle, noise, _NOISES * noise)
-    middle = np.nan_to_num(middle)
-    return middle, _narrow(width, np.where(middle < 0, below, most)), _narrow(width, finest)
-
-
-def _narrow(width: Array, limit: Array | float) -> Array:
-    """Return 1 up to the ``limit``, and 0 from twice of it on; between, a part: a jump would look
-    like a load."""
-    found: Array = np.nan_to_num(np.clip(2 - width / limit, 0, 1))
-    return found
-
-
-def _around(shared: Array, sure: Mask, record: Record) -> Array:
-    """Return what a pad ``shared`` (``[n]``) before or after each piece in its recording, where it
-    is ``sure`` (bool ``[n]``), whichever is less; 0: nowhere."""
-    n = len(shared)
-    step = np.arange(n)
-    begin = step - since_begin(record.first)
-    last = np.maximum.accumulate(np.where(sure, step, -1))
-    before = np.where(last >= begin, shared[last], np.inf)
-    end = _next(np.append(record.first[1:], True))
-    coming = _next(sure)
-    after = np.where(coming <= end, shared[np.minimum(coming, n - 1)], np.inf)
-    less = np.where(np.abs(before) <= np.abs(after), before, after)
-    found: Array = np.where(np.isinf(less), 0, less)
-    return found
-
-
-def _throughout(shared: Array, sure: Mask, record: Record) -> Array:
-    """Return what a pad ``shared`` (``[n]``) at least in each recording, where it is ``sure``
-    (bool ``[n]``); 0: nowhere, or less."""
-    first = np.flatnonzero(record.first)
-    lowest = np.minimum.reduceat(np.where(sure, shared, np.inf), first)
-    lowest = np.where(np.isinf(lowest), 0, np.maximum(lowest, 0))
-    found: Array = np.repeat(lowest, np.diff(np.append(first, len(record))))
-    return found
-
-
-def _next(on: Mask) -> Cells:
-    """Return the next step that is ``on`` (bool ``[n]``), this one or a later one, int ``[n]``; n:
-    none."""
-    n = len(on)
-    found: Cells = np.flip(np.minimum.accumulate(np.flip(np.where(on, np.arange(n), n))))
-    return found
-
-
 def _blocks(record: Record) -> Cells:
     """Return the first pieces of recordings, and of the parts of long ones, int ``[blocks]``."""
     return np.flatnonzero(since_begin(record.first) % _BLOCK == 0)
-
-
-def _usual(values: Array, limit: Array) -> tuple[Array, Mask]:
-    """Return what most of the blocks around each one agree on, ``[blocks, k]``, and whether they
-    do: they differ by less than the ``limit`` ``[k]``."""
-    half = _AROUND // 2
-    mirrored = np.pad(values, ((half, half), (0, 0)), mode="reflect")
-    around = sliding_window_view(mirrored, 2 * half + 1, axis=0)
-    middle, width = shortest(around.reshape(-1, 2 * half + 1), 0.5)
-    return middle.reshape(values.shape), width.reshape(values.shape) <= limit
-
-
-def shortest(values: Array, share: float) -> tuple[Array, Array]:
-    """Return middle and width of the shortest interval that holds a share of the values of each
-    row, ``[n]`` each of ``[n, k]``."""
-    ordered = np.sort(values, axis=1)
-    held = int(share * values.shape[1])
-    widths = ordered[:, held:] - ordered[:, : values.shape[1] - held]
-    widths = np.where(np.isnan(widths), np.inf, widths)
-    at = widths.argmin(axis=1)
-    row = np.arange(len(values))
-    middle = (ordered[row, at] + ordered[row, at + held]) / 2
-    return middle, widths[row, at]

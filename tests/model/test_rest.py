@@ -6,8 +6,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from diagnostics import SensorLayout
+from diagnostics.model.middles import shortest
 from diagnostics.model.record import Record, record_of
-from diagnostics.model.rest import Rest, _step, fit_rest, shortest
+from diagnostics.model.rest import Rest, _step, fit_rest
 from diagnostics.preprocessing.tolerance import converter_step
 
 PAD = np.repeat([0, 1], 12)

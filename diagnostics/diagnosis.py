@@ -13,11 +13,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from diagnostics.decision.address_aliasing import find_aliasing
-from diagnostics.decision.by_recording import HOLDS, with_recordings
+from diagnostics.decision.by_recording import of_any_movement, with_recordings
 from diagnostics.decision.certificate import Certificate, certify
+from diagnostics.decision.concluded import concluded
 from diagnostics.decision.judged import Judged
 from diagnostics.decision.result import Diagnosis
-from diagnostics.decision.root_causes import cut_off, pulling, root_causes
 from diagnostics.decision.serialization import (
     Arrays,
     from_state,
@@ -30,13 +30,12 @@ from diagnostics.evidence.read_out import Scan, scanned
 from diagnostics.evidence.reference import Reference, highest_reading, living
 from diagnostics.evidence.reference_faults import find_reference_faults, never_moved
 from diagnostics.evidence.stream_state import StreamState
-from diagnostics.faults import Fault, FaultKind
 from diagnostics.layout import SensorLayout
 from diagnostics.model import Model, fit_model
 from diagnostics.model.findings import judged_by_model
-from diagnostics.preprocessing.array_likes import plain_array
+from diagnostics.preprocessing.checked import axis_planes, checked_recordings
 from diagnostics.preprocessing.copies import find_copies
-from diagnostics.preprocessing.levels import LEAST_LOADED, LOW, MAJORITY, SLIGHT
+from diagnostics.preprocessing.levels import LOW
 from diagnostics.preprocessing.load import LoadDirection
 from diagnostics.preprocessing.quantiles import known_quantile
 from diagnostics.preprocessing.readings import RecordingBlocks
@@ -57,6 +56,7 @@ from diagnostics.when import (
     known_classes,
     own_reference,
     reads_enough,
+    shows_contacts,
 )
 from diagnostics.when.reference_findings import (
     ReferenceFinding,
@@ -65,9 +65,6 @@ from diagnostics.when.reference_findings import (
 )
 
 SCHEMA = "adaptfault.diagnoser/5"
-_LASTS = 8  # frames of a contact, at least
-# kinds that a cell shows however the others move
-_OF_ANY_MOVEMENT = (*HOLDS, FaultKind.ALIAS, FaultKind.NOISY)
 
 
 @dataclass(frozen=True)
@@ -376,7 +373,7 @@ class SelfDiagnosis:
         held = self._held(self.spans(log), tolerance_of(log, self.layout), classes)
         chosen = own_reference(log, held, classes)
         first = RecordingBlocks([log.given[i] for i in chosen])
-        if not _shows_contacts(first, log, self.layout):
+        if not shows_contacts(first, log, self.layout):
             return self
         own = SelfDiagnosis(**self.get_params())
         own._of_log = True
@@ -546,7 +543,17 @@ class SelfDiagnosis:
         stream = stream.complete()
         if not stream.received.any():
             raise ValueError("the recordings hold no frame with a reading: nothing to diagnose")
-        return self._concluded(stream, self._of_cells(stream), n_recordings)
+        judged = self._of_cells(stream)
+        shown = judged.shown
+        if self._of_log or self.reference_ is None:
+            shown = shown & reads_enough(stream.ranges, self._planes)
+        if stream.crosstalk is not None:
+            shown = shown & stream.crosstalk.own
+        # whether loads, as the stream holds them, may fall: a load direction, or a reference, tells
+        known = stream.load is not None or self.reference_ is not None
+        falls = False if known or self.layout.rest != "learn" else None
+        judged = replace(judged, shown=shown)
+        return concluded(stream, judged, n_recordings, self.layout, self._order, falls=falls)
 
     def _of_cells(self, stream: StreamState) -> Judged:
         """Return what is known of each cell of a log, before root causes."""
@@ -557,83 +564,6 @@ class SelfDiagnosis:
         assert isinstance(stream, ColdStream)
         aliases = find_aliasing(stream, partial(stream.cold.log_likelihood, stream))
         return judged_cold(stream, aliases, rate, full_scale)
-
-    def _concluded(self, stream: StreamState, judged: Judged, n_recordings: int) -> Diagnosis:
-        """Return the diagnosis of a log by what is known of each cell."""
-        found = judged.found.of(self._place)
-        causes, possible = root_causes(found, judged.aliases, self.layout)
-        contradicted = judged.contradicting > 0
-        unused = self._unused(stream, found.alive, causes, contradicted=contradicted)
-        unused &= found.refuted < 0  # what moves by itself does not rest
-        if unused.any():
-            found = found.without(unused)
-            causes, possible = root_causes(found, judged.aliases, self.layout)
-        probability = found.probability.copy()
-        still = [load.of(self._order, self.layout) for load in judged.still]
-        for load in still:
-            probability[list(load.cells)] = 1 - load.probability
-        probability, inferred = _with_causes(probability, causes)
-        # Noise alone is no test; nor is movement, where the reference tells how cells depend on
-        # each other; nor is a line that a shorted crossing pulls.
-        shown = judged.shown
-        shorts = [f.cells[0] for f in causes if f.kind is FaultKind.SHORT and f.line is None]
-        if judged.pulled is not None and shorts:
-            # a cell that reads a part of its load may be pulled
-            misleads = inferred.copy()
-            misleads[[c for f in causes if f.kind is FaultKind.WEAK for c in f.cells]] = False
-            pulled = judged.pulled(self._place[np.array(shorts)], misleads[self._order])
-            causes = pulling(causes, pulled[self._place], self.layout)
-            shown = shown & ~pulled
-        if self._of_log or self.reference_ is None:
-            shown = shown & reads_enough(stream.ranges, self._planes)
-        if stream.crosstalk is not None:
-            shown = shown & stream.crosstalk.own
-        scale = stream.scale
-        working = np.empty_like(inferred)
-        moved = bool((stream.runs.moved & stream.present).any())
-        working[self._place] = ~inferred & (found.alive if moved else self.layout.present.ravel())
-        # Where cells moved, loads of a frozen frame come or go: other cells have another offset.
-        rest = np.maximum(scale.baseline, stream.lowest) if moved else scale.baseline
-        return Diagnosis(
-            layout=self.layout,
-            faults=causes,
-            probability=probability,
-            tested=(found.alive & shown[self._place]) | inferred,
-            transport=stream.transport.faults(
-                rest + scale.near, working, self.layout.rate, moved, falls=self._falls(stream)
-            ),
-            evidence={name: values[self._place] for name, values in judged.evidence.items()},
-            n_frames=stream.transport.seen,
-            n_recordings=n_recordings,
-            possible=(*possible, *cut_off(unused, self.layout)),
-            static_loads=tuple(still),
-            contradicting=judged.contradicting,
-        )
-
-    def _unused(
-        self,
-        stream: StreamState,
-        alive: NDArray[np.bool_],
-        causes: Sequence[Fault],
-        *,
-        contradicted: bool,
-    ) -> NDArray[np.bool_]:
-        """Return the cells that are blamed although nothing may have touched their pad, and those
-        at rest beside them, bool ``[D]``. Most logs leave some pad alone and blame no cell of it.
-
-        ``contradicted``: so many cells contradict what the others say that none is blamed for it.
-        """
-        unused = stream.unused(alive[self._order])[self._place]
-        blamed = np.zeros_like(unused)
-        blamed[[cell for fault in causes for cell in fault.cells]] = True
-        blamed |= contradicted
-        pad = self.layout.pad_of
-        return np.asarray(unused & np.isin(pad, pad[unused & blamed]))
-
-    def _falls(self, stream: StreamState) -> bool | None:
-        """Return whether loads, as the stream holds them, may fall; None: nothing tells."""
-        is_known = stream.load is not None or self.reference_ is not None
-        return False if is_known or self.layout.rest != "learn" else None
 
     def without_gain(self, recordings: ArrayLike | Sequence[ArrayLike]) -> RecordingBlocks | None:
         """Return a log without the gain that the whole array has in it; None where it has none, or
@@ -692,11 +622,11 @@ class SelfDiagnosis:
             found = self._diagnosed(part, crosstalk=crosstalk)
             # a part of a log does not tell that all of it is disturbed
             moves = knows(some) and not whole.contradicting
-            return found if moves else _of_any_movement(found, held.suspect[list(some)])
+            return found if moves else of_any_movement(found, held.suspect[list(some)])
 
         whole = self._diagnosed(log, crosstalk=crosstalk)
         if not knows(tuple(range(len(log)))):
-            whole = _of_any_movement(whole, held.suspect)
+            whole = of_any_movement(whole, held.suspect)
         lengths = [len(given) for given in log.given]
         # without a reference, a part of a log tells less than the whole
         part = None if self.reference_ is None else of_part
@@ -740,113 +670,3 @@ class SelfDiagnosis:
         cold = SelfDiagnosis(layout)
         cold.reference_ = Reference.unknown(layout, rest)
         return cold._diagnosed(log, needed)
-
-
-def _of_any_movement(found: Diagnosis, suspect: NDArray[np.bool_]) -> Diagnosis:
-    """Return what is ``found`` of recordings of which it is not known how healthy cells move: told
-    is what holds a value (``suspect``: bool ``[n, D]``), or is noisy; the others are untested."""
-    holds = np.asarray(suspect.any(axis=0))
-    told = []
-    unknown = np.zeros(len(holds), bool)
-    for fault in found.faults:
-        if fault.kind in _OF_ANY_MOVEMENT or holds[list(fault.cells)].any():
-            told.append(fault)
-        else:
-            unknown[list(fault.cells)] = True
-    doubted = np.minimum(found.probability, MAJORITY)
-    return replace(
-        found,
-        faults=tuple(told),
-        probability=np.where(unknown, doubted, found.probability),
-        tested=found.tested & ~unknown,
-    )
-
-
-def _with_causes(
-    probability: NDArray[np.float64], causes: Sequence[Fault]
-) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Return P(faulty) ``[D]`` with the root causes, and the cells of these, bool ``[D]``."""
-    found = probability.copy()
-    blamed = np.zeros(len(found), bool)
-    for fault in causes:
-        cells = list(fault.cells)
-        found[cells] = np.maximum(found[cells], fault.probability or 0.0)
-        blamed[cells] = True
-    return found, blamed
-
-
-def axis_planes(layout: SensorLayout) -> tuple[SensorLayout, NDArray[np.intp]]:
-    """Return the array in which each axis of a pad is a pad of its own, and which cell each of its
-    cells is.
-
-    The neighbours of a cell are then cells of the same axis. With one axis: the layout itself.
-    """
-    cells = np.arange(layout.n_cells).reshape(layout.pads, layout.rows, layout.cols, layout.axes)
-    order = np.moveaxis(cells, 3, 1).ravel()
-    if layout.axes == 1:
-        return layout, order
-    rest = "middle" if layout.rest == "learn" else layout.rest
-    present = layout.present.ravel()[order]
-    pads = layout.pads * layout.axes
-    return replace(
-        layout,
-        pads=pads,
-        axes=1,
-        present=present,
-        wiring="bus",
-        groups=None,
-        rest=rest,
-        names=None,
-    ), order
-
-
-def _shows_contacts(first: RecordingBlocks, log: RecordingBlocks, layout: SensorLayout) -> bool:
-    """Return whether most cells are loaded in the ``first`` recordings of a log, by what loads
-    there are in it: loads last, noise does not."""
-    present = layout.present.ravel()
-    given = first.valid(layout.full_scale, present)
-    before = _typical_range(given, present)
-    typical = _typical_range(log.valid(layout.full_scale, present), present)
-    lasting = _typical_range(RecordingBlocks([_means(frames) for frames in given]), present)
-    lasts = lasting >= MAJORITY * before
-    return lasts and before > SLIGHT * layout.full_scale and before >= LEAST_LOADED * typical
-
-
-def _means(frames: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the means of pieces of a recording ``[T, D]``, without missing readings; of a short
-    one, its frames."""
-    pieces = len(frames) // _LASTS
-    if pieces < 2:
-        return frames
-    parts = frames[: pieces * _LASTS].reshape(pieces, _LASTS, -1)
-    count = np.isfinite(parts).sum(axis=1)
-    return np.where(count > 0, np.nansum(parts, axis=1) / np.maximum(count, 1), np.nan)
-
-
-def _typical_range(recordings: RecordingBlocks, present: NDArray[np.bool_]) -> float:
-    """Return the median over cells of the range of readings; 0 without any."""
-    low, high = recordings.extremes()
-    ranges = (high - low)[present]
-    received = ranges[np.isfinite(ranges)]
-    return float(np.median(received)) if len(received) else 0.0
-
-
-def checked_recordings(
-    recordings: ArrayLike | Sequence[ArrayLike], layout: SensorLayout
-) -> RecordingBlocks:
-    """Return the recordings as blocks, each ``[T, D]`` with T >= 1."""
-    checked = [
-        _checked(r, f"recording {i}", layout) for i, r in enumerate(layout.recordings(recordings))
-    ]
-    checked = [r for r in checked if len(r)]
-    if not checked:
-        raise ValueError("no frames: expected recordings [T, D] with T >= 1")
-    return RecordingBlocks(checked)
-
-
-def _checked(recording: ArrayLike, name: str, layout: SensorLayout) -> NDArray[Any]:
-    """Return a recording as ``[T, D]``, in its own dtype."""
-    given = plain_array(recording)
-    if given.dtype.kind in "fiu" and given.shape[1:] in (layout.shape, (layout.n_cells,)):
-        return given.reshape(len(given), layout.n_cells)
-    return layout.check_recording(recording, name)

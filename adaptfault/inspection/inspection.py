@@ -18,7 +18,7 @@ from adaptfault.inspection.converter_range import within_range
 from adaptfault.inspection.find_changes import find_changed_readings, find_sensor_change
 from adaptfault.inspection.result import Finding, Inspection, finding_of, of_diagnosis
 from diagnostics import Diagnosis, FaultSet, SelfDiagnosis, SensorLayout
-from diagnostics.diagnosis import checked_recordings
+from diagnostics.preprocessing.checked import checked_recordings
 from diagnostics.preprocessing.readings import RecordingBlocks
 from diagnostics.sensor.common_mode import find_common_mode
 from diagnostics.sensor.disturbance import Disturbance, find_disturbances, find_sentinel

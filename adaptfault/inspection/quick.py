@@ -90,7 +90,7 @@ def quick(statistics: Statistics) -> Quick:
     planes = layout
     order = np.arange(layout.n_cells)
     if layout.axes > 1:
-        from diagnostics.diagnosis import axis_planes  # slow to import, and rarely needed
+        from diagnostics.preprocessing.checked import axis_planes
 
         planes, order = axis_planes(layout)
     place = np.argsort(order)

@@ -29,8 +29,10 @@ if TYPE_CHECKING:
 
 _LISTED = 5  # places in a sentence
 _PARTS = 4  # sets of recordings that are diagnosed, at most: a size
-HOLDS = (FaultKind.OPEN, FaultKind.SHORT, FaultKind.STUCK)
-_COMES = (*HOLDS, FaultKind.INTERMITTENT)
+_HOLDS = (FaultKind.OPEN, FaultKind.SHORT, FaultKind.STUCK)
+_COMES = (*_HOLDS, FaultKind.INTERMITTENT)
+# kinds that a cell shows however the others move
+_OF_ANY_MOVEMENT = (*_HOLDS, FaultKind.ALIAS, FaultKind.NOISY)
 
 Cells = NDArray[np.intp]
 Recordings = tuple[int, ...]
@@ -289,3 +291,23 @@ def _verdicts(
             shows = np.isin(number, fault.recordings)
         code[np.ix_(shows, np.array(fault.cells))] = Verdict.FAULTY
     return code
+
+
+def of_any_movement(found: Diagnosis, suspect: NDArray[np.bool_]) -> Diagnosis:
+    """Return what is ``found`` of recordings of which it is not known how healthy cells move: told
+    is what holds a value (``suspect``: bool ``[n, D]``), or is noisy; the others are untested."""
+    holds = np.asarray(suspect.any(axis=0))
+    told = []
+    unknown = np.zeros(len(holds), bool)
+    for fault in found.faults:
+        if fault.kind in _OF_ANY_MOVEMENT or holds[list(fault.cells)].any():
+            told.append(fault)
+        else:
+            unknown[list(fault.cells)] = True
+    doubted = np.minimum(found.probability, MAJORITY)
+    return replace(
+        found,
+        faults=tuple(told),
+        probability=np.where(unknown, doubted, found.probability),
+        tested=found.tested & ~unknown,
+    )

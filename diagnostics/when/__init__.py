@@ -25,6 +25,7 @@ from diagnostics.when.own_reference import (
     known_classes,
     own_reference,
     reads_enough,
+    shows_contacts,
 )
 from diagnostics.when.spans import Spans
 
@@ -37,4 +38,5 @@ __all__ = [
     "known_classes",
     "own_reference",
     "reads_enough",
+    "shows_contacts",
 ]

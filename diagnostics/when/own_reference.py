@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from diagnostics.preprocessing.levels import LEAST_LOADED, MAJORITY
+from diagnostics.preprocessing.levels import LEAST_LOADED, MAJORITY, SLIGHT
 from diagnostics.preprocessing.quantiles import known_quantile
 from diagnostics.preprocessing.readings import RecordingBlocks
 from diagnostics.when.held import Held
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 
 # recordings from which on a log is its own reference
 OWN_REFERENCE = 16
+_LASTS = 8  # frames of a contact, at least
 
 
 def own_reference(log: RecordingBlocks, held: Held, classes: ArrayLike | None) -> list[int]:
@@ -78,3 +79,34 @@ def reads_enough(ranges: NDArray[np.float64], layout: SensorLayout) -> NDArray[n
     # where there are none, nothing contradicts
     found: NDArray[np.bool_] = ranges >= MAJORITY * np.nan_to_num(beside)
     return found
+
+
+def shows_contacts(first: RecordingBlocks, log: RecordingBlocks, layout: SensorLayout) -> bool:
+    """Return whether most cells are loaded in the ``first`` recordings of a log, by what loads
+    there are in it: loads last, noise does not."""
+    present = layout.present.ravel()
+    given = first.valid(layout.full_scale, present)
+    before = _typical_range(given, present)
+    typical = _typical_range(log.valid(layout.full_scale, present), present)
+    lasting = _typical_range(RecordingBlocks([_means(frames) for frames in given]), present)
+    lasts = lasting >= MAJORITY * before
+    return lasts and before > SLIGHT * layout.full_scale and before >= LEAST_LOADED * typical
+
+
+def _means(frames: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the means of pieces of a recording ``[T, D]``, without missing readings; of a short
+    one, its frames."""
+    pieces = len(frames) // _LASTS
+    if pieces < 2:
+        return frames
+    parts = frames[: pieces * _LASTS].reshape(pieces, _LASTS, -1)
+    count = np.isfinite(parts).sum(axis=1)
+    return np.where(count > 0, np.nansum(parts, axis=1) / np.maximum(count, 1), np.nan)
+
+
+def _typical_range(recordings: RecordingBlocks, present: NDArray[np.bool_]) -> float:
+    """Return the median over cells of the range of readings; 0 without any."""
+    low, high = recordings.extremes()
+    ranges = (high - low)[present]
+    received = ranges[np.isfinite(ranges)]
+    return float(np.median(received)) if len(received) else 0.0

@@ -176,6 +176,7 @@ def fit_model(
     log = Log(record, symbols, present, living)
     groups, chain = fit_groups(as_one, log, half)
     held_out = _held_out(reference, symbols, examples, resting, chain)
+    del examples  # a hundred megabytes of a large array
     progress(0.5)
     flatness = reference.flatness(symbols, np.ones(len(record), bool))
     model = Model.of(symbols, flatness, predictor, length, longest, present, living, lines, groups)

@@ -27,7 +27,6 @@ _ODD = 8.0  # nats of a unit beyond those expected
 # of a held value without and with dither
 _LOOKS = np.log([[0.99, 0.007, 0.003], [0.1, 0.88, 0.02]])
 _USUALLY = 8.0  # cells that the usual look of a piece is worth
-_LEAST = 1e-6  # probability whose logarithm is taken
 
 
 class Log:
@@ -299,8 +298,7 @@ class Observed:
     @cached_property
     def odd(self) -> Mask:
         """Units in which cells read what a healthy one hardly does, bool ``[units, D]``."""
-        p = np.maximum(self.levels, _LEAST)
-        expected = (self.levels * np.log(p)).sum(axis=-1)
+        expected = np.einsum("ndk,ndk->nd", self.levels, np.log(self.levels))
         surprise = self.log.record.sum_of_units(self.of_level - expected)
         found: Mask = surprise < -_ODD
         return found

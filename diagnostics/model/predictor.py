@@ -8,9 +8,10 @@ once, when it begins.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +26,7 @@ from diagnostics.preprocessing.levels import FEWEST
 
 _GUESS = 0.002  # of a uniform distribution in any prediction: models err
 _BLUR = 0.02  # of a level that is one further up, or down
+_INPUTS = 21
 _HIDDEN = (32, 32)
 _BATCH = 2048
 _STEPS = 1000
@@ -40,7 +42,7 @@ _RINGS = {1: (1,), 2: (2,), 4: (4, 5, 8)}  # squared distances of the cells of a
 
 @dataclass(frozen=True)
 class Network:
-    """A perceptron with the softmax over levels.
+    """A perceptron with the softmax over levels, which errs now and then.
 
     Attributes:
         mean, deviation: of the inputs.
@@ -56,13 +58,15 @@ class Network:
     def fit(
         cls, inputs: Array, level: NDArray[np.integer], n_levels: int, most: float = 1.0
     ) -> Network:
-        """Fit to inputs ``[n, k]`` and levels int ``[n]``; the same every time. ``most``: share of
-        the usual steps."""
+        """Fit to inputs ``[n, k]``, which are overwritten, and levels int ``[n]``; the same every
+        time. ``most``: share of the usual steps."""
         from sklearn.neural_network import MLPClassifier
 
-        mean = inputs.mean(axis=0)
-        deviation = inputs.std(axis=0) + np.float32(1e-6)
-        z = (inputs - mean) / deviation
+        z = inputs
+        mean = z.mean(axis=0)
+        deviation = np.stack([column.std() for column in z.T]) + np.float32(1e-6)
+        z -= mean
+        z /= deviation
         rng = np.random.default_rng(0)
         steps = int(max(_FEWEST_STEPS, min(_EPOCHS * len(z) / _BATCH, most * _STEPS)))
         fit = MLPClassifier(_HIDDEN, learning_rate_init=_RATE, alpha=1e-6, random_state=0)
@@ -97,9 +101,9 @@ class Network:
         logits = self.weights[-1].T @ hidden
         logits += self.biases[-1][:, None]
         logits -= logits.max(axis=0)
-        found: Array = np.exp(logits, out=logits)
+        found = np.exp(logits, out=logits)
         found /= found.sum(axis=0)
-        return found
+        return _errs(len(found)) @ found
 
 
 @dataclass(frozen=True)
@@ -177,26 +181,34 @@ class Predictor:
             first: bool ``[n]``, a recording begins.
             known: the cells that tell.
         """
-        n, d = load.shape
+        found = np.empty((_INPUTS, *load.shape), np.float32)
+        for place, column in zip(found, self._columns(load, own, first, known), strict=True):
+            place[...] = column
+        return np.moveaxis(found, 0, -1)
+
+    def _columns(self, load: Array, own: Array, first: Mask, known: Mask) -> Iterator[NDArray[Any]]:
+        """Yield each input, ``[n, D]`` or what has its shape once it is repeated; arguments as of
+        :meth:`inputs`."""
         told = np.where(known, load, 0).astype(np.float32)
         on = loaded(told)
         telling = known.astype(np.float32)
         mean, surely = self.mean.predict(load, known)
         mean = np.clip(mean, -0.2, 1)
         surely = np.clip(surely, -0.3, 1.3)
-        columns = [mean, np.sqrt(np.maximum(mean, 0)), surely]
+        yield from (mean, np.sqrt(np.maximum(mean, 0)), surely)
         for ring in self._rings:
             count = np.maximum(ring @ telling, 1)
-            columns += [(ring @ told.T).T / count, (ring @ on.T).T / count]
-        columns.append(np.broadcast_to(np.minimum(self._rings[0] @ telling, 4), (n, d)))
+            yield (ring @ told.T).T / count
+            yield (ring @ on.T).T / count
+        yield np.minimum(self._rings[0] @ telling, 4)
         count = np.maximum(self.on_pad(telling), 1)
-        columns += [self.on_pad(told) / count, self.on_pad(on) / count]
-        columns.append(np.broadcast_to(told.mean(axis=1, keepdims=True), (n, d)))
-        columns += [np.broadcast_to(one, (n, d)) for one in self.usual.T]
+        yield self.on_pad(told) / count
+        yield self.on_pad(on) / count
+        yield told.mean(axis=1, keepdims=True)
+        yield from self.usual.T
         last = _before(own, first)
-        columns += [last, loaded(last), _before(mean, first), _before(surely, first)]
-        columns.append(np.broadcast_to(first[:, None], (n, d)))
-        return np.moveaxis(np.stack(columns, dtype=np.float32), 0, -1)
+        yield from (last, loaded(last), _before(mean, first), _before(surely, first))
+        yield first[:, None]
 
     @cached_property
     def _rings(self) -> list[csr_array]:
@@ -224,8 +236,7 @@ class Predictor:
         """Return P(level) ``[n, D, K]``; arguments as for :meth:`inputs`."""
         if self.network is None:
             raise ValueError("the predictor has no network yet")
-        found: Array = self.network(self.inputs(load, own, first, known))
-        return found @ _errs(found.shape[-1])
+        return self.network(self.inputs(load, own, first, known))
 
 
 @cache

@@ -33,8 +33,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import ndtri
-from scipy.stats import chi2
+from scipy.special import gammaincinv, ndtri
 
 from diagnostics.evidence.prediction import OUTLIERS, log_student_t
 from diagnostics.model.symbols import NOTHING, root_load
@@ -431,7 +430,8 @@ def noise_of(recordings: Sequence[Floats]) -> Floats:
     spreads = np.concatenate(quiet)
     if not len(spreads):
         return np.zeros(recordings[0].shape[1])
-    least = np.sqrt(chi2.ppf(LOW, FEWEST - 1) / FEWEST)  # spread of so few normal errors
+    # of so few normal errors the spread: chi2.ppf of scipy.stats, which is slow to import
+    least = np.sqrt(2 * gammaincinv((FEWEST - 1) / 2, LOW) / FEWEST)
     noise: Floats = np.quantile(spreads, LOW, axis=0) / least
     return noise
 

@@ -1,18 +1,22 @@
-"""How the crossings of an array answer a scan of its read-out, and whether current can reach them
-on other ways than their own.
+"""How the crossings of an array answer a scan of its read-out, and how much of it may come through
+other crossings.
 
 A read-out that lets the lines float which it neither drives nor reads sends current through other
-crossings, so that an open one answers, too. The resistances R between a row and a column are then
-those of one network, and such resistances are a metric (Klein and Randic 1993)::
+crossings, so that an open one answers, too. Two levels do not tell: resistances answer in
+proportion on any way. What tells is that all crossings share the ways through others. With the
+conductances G of the crossings, and L from each line to ground, a crossing reads (Kirchhoff; Z is
+the inverse of the matrix of G and L)::
 
-    R_ij <= R_il + R_kl + R_kj        for all rows k and columns l
+    T_ij = Z_ij / (Z_ii Z_jj - Z_ij^2) = G_ij + S_ij     S: through others, the more the less L is
 
-A crossing that conducts less than three others in series refutes that its lines float. Leakage to
-ground takes from the current through others, so that open crossings conduct less, too: several
-crossings have to, without those of one line, which may be cut, or one that does not conduct at all.
+L is unknown: large where lines are held, small where they float. But no S is more than what its
+crossing reads, so that one which reads little bounds L from below, and S of all others from above.
+G is taken for what they read, then for what is left of it without S, and the larger S counts. A
+crossing conducts for certain if it reads more than :data:`CERTAINLY` times S. So a silent one
+proves that others conduct, and an open one, which reads S alone, is left untested.
 
-Where lines float, and leak to ground more than ten times as well as an untouched crossing conducts,
-open ones may still pass for held ones that conduct little (``examples/read_out_bench.py``).
+Not covered: leakages of lines that differ by more than a factor of ten; some open crossings may
+then pass for held ones that conduct little.
 """
 
 from __future__ import annotations
@@ -35,13 +39,17 @@ REPEATS = 4
 STANDS = 5.0
 """Standard errors that are no noise."""
 
+CERTAINLY = 3.0
+"""Times what may come through others: it covers leakages that differ by a factor of ten."""
+
 _LEAST_SPREAD = 0.5  # standard deviation of log r of healthy crossings
 _IN_PROPORTION = 0.25  # ratio - 1
 _FAINT = 0.03  # of the usual response: a line on ground
 _FEWEST = 3  # crossings of such a line
 _OF_MEDIAN = 1.25  # standard error of a median, in those of a mean
-_REFUTING = 0.04  # share of the crossings that conduct less than others in series
-_FEWEST_REFUTING = 5
+_SHORTED = 1e3  # times the highest response
+_LEAKS = (1e-4, 1e6)  # from each line, times what its crossings conduct together
+_PRECISE = 0.01  # of the logarithm of the leakage
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -119,6 +127,28 @@ def on_faint_lines(response: Floats, healthy: Healthy, tells: Mask, layout: Sens
     return found
 
 
+def beside_shorts(short: Mask, unproven: Mask, layout: SensorLayout) -> Mask:
+    """Return the crossings that shorted ones may join with other ways, also where lines are held,
+    bool ``[D]``.
+
+    With (c, d) shorted, the part of column p beyond a cut, which floats, leads from row i over row
+    c to column d if (i, p) and (c, p) lie on it: these do not conduct. Rows alike.
+
+    Args:
+        short: bool ``[D]``.
+        unproven: crossings that may not conduct, bool ``[D]``.
+        layout: the array.
+    """
+    if not layout.is_matrix:
+        return np.zeros_like(short)
+    joins = layout.grid(short).astype(np.intp)
+    part = layout.grid(unproven).astype(np.intp)
+    back = part.swapaxes(1, 2)
+    fed = part @ back @ joins + joins @ back @ part
+    found: Mask = (fed > 0).reshape(-1)
+    return found
+
+
 def in_parallel(short: Mask, layout: SensorLayout) -> Mask:
     """Return the crossings that shorted ones join in parallel with another one, bool ``[D]``: with
     (a, b) and (c, d) shorted, (a, d) and (c, b) lie between the same two wires."""
@@ -168,39 +198,66 @@ class Healthy:
         return self.usual * float(min(_FAINT, np.exp(-by_chance)))
 
 
-def holds_lines(
-    response: Floats, least: Floats, answers: Mask, silent: Mask, layout: SensorLayout
-) -> bool:
-    """Return whether crossings show that lines which are not selected do not float.
-
-    False says nothing where crossings conduct alike: three of them in series conduct less.
+def through_others(
+    response: Floats, least: Floats, tells: Mask, short: Mask, layout: SensorLayout
+) -> Floats:
+    """Return the most that may come through other crossings, ``[D]``, where lines float and leak.
 
     Args:
-        response: of each crossing, ``[D]``.
+        response: of each crossing, ``[D]``; NaN: not measured.
         least: what it is certain to, ``[D]``.
-        answers, silent: bool ``[D]``.
+        tells, short: bool ``[D]``; what tells nothing conducts as most do.
         layout: the array.
     """
-    if not layout.is_matrix:
-        return True
-    known = np.where(answers, np.maximum(response - least, 0.0), 0.0)
-    weaker = response + least < _through_three(layout.grid(known)).reshape(-1)
-    if (weaker & silent).any():
-        return True
-    refuting = layout.grid(weaker & answers)
-    of_one_line = max(refuting.sum(axis=2).max(), refuting.sum(axis=1).max())
-    needed = max(_FEWEST_REFUTING, _REFUTING * int(answers.sum()))
-    return bool(refuting.sum() - of_one_line >= needed)
+    if not layout.is_matrix or not tells.any():
+        return np.zeros_like(response)
+    known = np.maximum(response[tells], 0.0)
+    given = np.full_like(response, float(np.median(known)))
+    given[tells] = known
+    given[short] = _SHORTED * float(known.max())
+    given[~layout.present.ravel()] = 0.0
+    most = np.where(tells, given + least, np.inf)
+    pads = [_through(*of) for of in zip(layout.grid(given), layout.grid(most), strict=True)]
+    found: Floats = np.stack(pads).reshape(-1)
+    return found
 
 
-def _through_three(conductance: Floats) -> Floats:
-    """Return what the best three crossings in series conduct that lead from a row to a column, each
-    ``[pads, rows, cols]``."""
-    ohms = np.full_like(conductance, np.inf)
-    np.divide(1.0, conductance, out=ohms, where=conductance > 0)
-    best = np.empty_like(ohms)
-    for pad, one in enumerate(ohms):
-        between = (one[:, :, None] + one.T[None]).min(axis=1)  # of two rows, by a column
-        best[pad] = (between[:, :, None] + one[None]).min(axis=1)
-    found: Floats = 1 / best
+def _through(given: Floats, most: Floats) -> Floats:
+    """Return the most that may come through other crossings of a pad, ``[rows, cols]``.
+
+    Args:
+        given: what each reads.
+        most: the same, and its error; infinite: it bounds nothing.
+    """
+    found = np.zeros_like(given)
+    usual = float(given.sum(axis=1).mean())
+    if not usual:
+        return found
+    for _ in range(2):
+        own = np.maximum(given - found, 0.0)
+        low, high = np.log(usual) + np.log(_LEAKS)
+        while high - low > _PRECISE:
+            middle = (low + high) / 2
+            if (_beside(own, np.exp(middle)) > most).any():
+                low = middle
+            else:
+                high = middle
+        found = np.maximum(found, _beside(own, np.exp(low)))
+    return found
+
+
+def _beside(conductance: Floats, leak: float) -> Floats:
+    """Return what comes through other crossings where each line leaks alike, ``[rows, cols]``."""
+    rows = len(conductance)
+    matrix = np.block(
+        [
+            [np.diag(conductance.sum(axis=1)), -conductance],
+            [-conductance.T, np.diag(conductance.sum(axis=0))],
+        ]
+    )
+    inverse = np.linalg.inv(matrix + leak * np.eye(len(matrix)))
+    own = np.diag(inverse)
+    between = inverse[:rows, rows:]
+    whole = between / (own[:rows, None] * own[rows:] - between**2)
+    found: Floats = np.maximum(whole - conductance, 0.0)
     return found

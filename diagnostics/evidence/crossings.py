@@ -15,6 +15,10 @@ G is taken for what they read, then for what is left of it without S, and the la
 crossing conducts for certain if it reads more than :data:`CERTAINLY` times S. So a silent one
 proves that others conduct, and an open one, which reads S alone, is left untested.
 
+The part of a line beyond a cut leaks nothing, and joins the lines that cross it. Crossings that do
+not conduct for certain may lie on one. Where a crossing is shorted, it brings current also to lines
+that are held.
+
 Not covered: leakages of lines that differ by more than a factor of ten; some open crossings may
 then pass for held ones that conduct little.
 """
@@ -49,6 +53,7 @@ _FEWEST = 3  # crossings of such a line
 _OF_MEDIAN = 1.25  # standard error of a median, in those of a mean
 _SHORTED = 1e3  # times the highest response
 _LEAKS = (1e-4, 1e6)  # from each line, times what its crossings conduct together
+_HELD = 100.0  # of a line that is held, the same
 _PRECISE = 0.01  # of the logarithm of the leakage
 
 Floats = NDArray[np.float64]
@@ -127,28 +132,6 @@ def on_faint_lines(response: Floats, healthy: Healthy, tells: Mask, layout: Sens
     return found
 
 
-def beside_shorts(short: Mask, unproven: Mask, layout: SensorLayout) -> Mask:
-    """Return the crossings that shorted ones may join with other ways, also where lines are held,
-    bool ``[D]``.
-
-    With (c, d) shorted, the part of column p beyond a cut, which floats, leads from row i over row
-    c to column d if (i, p) and (c, p) lie on it: these do not conduct. Rows alike.
-
-    Args:
-        short: bool ``[D]``.
-        unproven: crossings that may not conduct, bool ``[D]``.
-        layout: the array.
-    """
-    if not layout.is_matrix:
-        return np.zeros_like(short)
-    joins = layout.grid(short).astype(np.intp)
-    part = layout.grid(unproven).astype(np.intp)
-    back = part.swapaxes(1, 2)
-    fed = part @ back @ joins + joins @ back @ part
-    found: Mask = (fed > 0).reshape(-1)
-    return found
-
-
 def in_parallel(short: Mask, layout: SensorLayout) -> Mask:
     """Return the crossings that shorted ones join in parallel with another one, bool ``[D]``: with
     (a, b) and (c, d) shorted, (a, d) and (c, b) lie between the same two wires."""
@@ -199,55 +182,88 @@ class Healthy:
 
 
 def through_others(
-    response: Floats, least: Floats, tells: Mask, short: Mask, layout: SensorLayout
+    response: Floats, least: Floats, tells: Mask, short: Mask, layout: SensorLayout, *, held: bool
 ) -> Floats:
-    """Return the most that may come through other crossings, ``[D]``, where lines float and leak.
+    """Return the most that may come through other crossings, ``[D]``.
 
     Args:
         response: of each crossing, ``[D]``; NaN: not measured.
         least: what it is certain to, ``[D]``.
-        tells, short: bool ``[D]``; what tells nothing conducts as most do.
+        tells, short: bool ``[D]``; what tells nothing conducts as the others on average.
         layout: the array.
+        held: whether it is known that lines are held.
     """
     if not layout.is_matrix or not tells.any():
         return np.zeros_like(response)
     known = np.maximum(response[tells], 0.0)
-    given = np.full_like(response, float(np.median(known)))
+    usual = float(known.mean())
+    given = np.full_like(response, usual)
     given[tells] = known
     given[short] = _SHORTED * float(known.max())
     given[~layout.present.ravel()] = 0.0
-    most = np.where(tells, given + least, np.inf)
-    pads = [_through(*of) for of in zip(layout.grid(given), layout.grid(most), strict=True)]
+    error = np.where(tells, least, np.inf)
+    grids = zip(layout.grid(given), layout.grid(error), strict=True)
+    pads = [_through(*of, usual, held=held) for of in grids]
     found: Floats = np.stack(pads).reshape(-1)
     return found
 
 
-def _through(given: Floats, most: Floats) -> Floats:
+def _through(given: Floats, error: Floats, usual: float, *, held: bool) -> Floats:
     """Return the most that may come through other crossings of a pad, ``[rows, cols]``.
 
     Args:
         given: what each reads.
-        most: the same, and its error; infinite: it bounds nothing.
+        error: what it is certain to; infinite: it bounds nothing.
+        usual: what they read on average.
+        held: whether it is known that lines are held.
     """
+    rows, cols = given.shape
     found = np.zeros_like(given)
-    usual = float(given.sum(axis=1).mean())
-    if not usual:
+    whole = np.zeros((rows + cols, rows + cols))
+    cut = whole.copy()
+    together = usual * max(rows, cols)
+    if not together:
         return found
     for _ in range(2):
         own = np.maximum(given - found, 0.0)
-        low, high = np.log(usual) + np.log(_LEAKS)
-        while high - low > _PRECISE:
+        low, high = np.log(together) + np.log(_LEAKS)
+        while not held and high - low > _PRECISE:
             middle = (low + high) / 2
-            if (_beside(own, np.exp(middle)) > most).any():
+            if (_beside(own, np.exp(middle), whole) > given + error).any():
                 low = middle
             else:
                 high = middle
-        found = np.maximum(found, _beside(own, np.exp(low)))
+        leak = _HELD * together if held else np.exp(low)
+        found = np.maximum.reduce([found, *(_beside(own, leak, lines) for lines in (whole, cut))])
+        unproven = np.isfinite(error) & (given - error <= CERTAINLY * found)
+        cut[:rows, :rows] = usual * _cut_off(unproven.astype(np.float64))
+        cut[rows:, rows:] = usual * _cut_off(unproven.T.astype(np.float64))
     return found
 
 
-def _beside(conductance: Floats, leak: float) -> Floats:
-    """Return what comes through other crossings where each line leaks alike, ``[rows, cols]``."""
+def _cut_off(unproven: Floats) -> Floats:
+    """Return the matrix of conductances between rows, ``[rows, rows]``, through parts of columns
+    that are cut off, in conductances of a crossing.
+
+    Such a part joins the rows of its crossings, which do not conduct to the column, and leaks
+    nothing.
+
+    Args:
+        unproven: 1 where a crossing may not conduct, ``[rows, cols]``.
+    """
+    each = unproven / np.maximum(unproven.sum(axis=0), 1.0)
+    found: Floats = np.diag(unproven.sum(axis=1)) - each @ unproven.T
+    return found
+
+
+def _beside(conductance: Floats, leak: float, cut: Floats) -> Floats:
+    """Return what comes through other crossings, ``[rows, cols]``.
+
+    Args:
+        conductance: of the crossings, ``[rows, cols]``.
+        leak: from each line to ground.
+        cut: matrix of the conductances between lines, ``[rows + cols, rows + cols]``.
+    """
     rows = len(conductance)
     matrix = np.block(
         [
@@ -255,9 +271,9 @@ def _beside(conductance: Floats, leak: float) -> Floats:
             [-conductance.T, np.diag(conductance.sum(axis=0))],
         ]
     )
-    inverse = np.linalg.inv(matrix + leak * np.eye(len(matrix)))
+    inverse = np.linalg.inv(matrix + cut + leak * np.eye(len(matrix)))
     own = np.diag(inverse)
     between = inverse[:rows, rows:]
-    whole = between / (own[:rows, None] * own[rows:] - between**2)
-    found: Floats = np.maximum(whole - conductance, 0.0)
+    read = between / (own[:rows, None] * own[rows:] - between**2)
+    found: Floats = np.maximum(read - conductance, 0.0)
     return found

@@ -50,7 +50,6 @@ from diagnostics.evidence.crossings import (
     Answer,
     Healthy,
     Level,
-    beside_shorts,
     in_parallel,
     on_faint_lines,
     through_others,
@@ -164,7 +163,7 @@ class ReadOut:
         """One fault a cause: a line, or a crossing."""
         silent = self.open | self.held
         certain = silent & (self.evidence >= _OPEN)
-        others = self.alive | self.short
+        others = self.short | ((self.response > self.least) & ~silent)
         causes = list(solve(certain, silent, others, self.evidence, self.layout))
         shorted = [Cause(None, (c,), (c,), 1.0) for c in np.flatnonzero(self.short).tolist()]
         return tuple(self._fault(cause) for cause in [*causes, *shorted] if cause.proven)
@@ -349,15 +348,10 @@ def _judged(
     least = STANDS * answer.error
     answers = tells & (answer.response > least)
     silent = tells & (np.abs(answer.response) <= least)
-    if held is None:
-        through = through_others(answer.response, least, tells, short, layout)
-        direct = answers & (answer.response - least > CERTAINLY * through)
-    else:
-        direct = answers & held
+    through = through_others(answer.response, least, tells, short, layout, held=held is True)
+    direct = answers & (answer.response - least > CERTAINLY * through) & (held is not False)
     usual = 0.0
     faint = np.zeros_like(tells)
-    fed = beside_shorts(short, tells & ~direct, layout)
-    direct &= ~fed
     evidence = np.where(direct, -CERTAIN_RATIO, 0.0)
     if answers.sum() >= MAJORITY * measured.sum() > 0:
         healthy = Healthy.of(answer.response[answers])
@@ -369,7 +363,7 @@ def _judged(
     at_supply = no_answer & (zero.mean > STANDS * zero.error + _RESIDUE * usual)
     conducts = answers & answer.in_proportion & ~faint & (usual > 0)
     alive = conducts & direct
-    doubted = int((conducts & ~alive & ~fed).sum())
+    doubted = 0 if held else int((conducts & ~alive).sum())
     certain = short | everywhere | faint
     return ReadOut(
         layout,

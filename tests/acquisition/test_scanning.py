@@ -15,7 +15,7 @@ from adaptfault.acquisition import (
 )
 from adaptfault.acquisition.ordering import Frame
 from adaptfault.acquisition.scanning import Scans
-from diagnostics import SensorLayout
+from diagnostics import Monitor, SelfDiagnosis, SensorLayout
 from diagnostics.simulation.circuit import Circuit, CutLine, StuckCell
 from diagnostics.simulation.scan import scan_circuit
 from diagnostics.wiring import Line
@@ -29,20 +29,16 @@ SCAN = scan_circuit(
 )
 
 
-class Watcher:
-    """What a session asks: it notes what it is given, and says nothing."""
-
-    layout = LAYOUT
-    evaluated = None
+class Watcher(Monitor):
+    """Notes which frames it is given."""
 
     def __init__(self):
+        super().__init__(SelfDiagnosis(LAYOUT))
         self.given = []
 
-    def stream(self, frame, time=None):
-        from types import SimpleNamespace
-
+    def update(self, frame, time=None):
         self.given.append(time)
-        return SimpleNamespace(label=None, events=(), faults=(), probabilities=None)
+        return super().update(frame, time)
 
 
 def stream(scan=SCAN, before=5, after=25, start=0.0):

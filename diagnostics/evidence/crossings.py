@@ -9,15 +9,16 @@ the inverse of the matrix of G and L)::
 
     T_ij = Z_ij / (Z_ii Z_jj - Z_ij^2) = G_ij + S_ij     S: through others, the more the less L is
 
-L is unknown: large where lines are held, small where they float. But no S is more than what its
-crossing reads, so that one which reads little bounds L from below, and S of all others from above.
-G is taken for what they read, then for what is left of it without S, and the larger S counts. A
-crossing conducts for certain if it reads more than :data:`CERTAINLY` times S. So a silent one
-proves that others conduct, and an open one, which reads S alone, is left untested.
+L is unknown: large where lines are held, small where they float; one read-out drives all pads. But
+no S is more than what its crossing reads, so that one which reads little bounds L from below, and S
+of all others from above. G is taken for what they read, then for what is left of it without S, and
+the larger S counts. A crossing conducts for certain if it reads more than :data:`CERTAINLY` times
+S. So a silent one proves that others conduct, and an open one, which reads S alone, is left
+untested.
 
 The part of a line beyond a cut leaks nothing, and joins the lines that cross it. Crossings that do
-not conduct for certain may lie on one. Where a crossing is shorted, it brings current also to lines
-that are held.
+not conduct for certain may lie on one, and one of them may be shorted. Where a crossing is shorted,
+it brings current also to lines that are held.
 
 Not covered: leakages of lines that differ by more than a factor of ten; some open crossings may
 then pass for held ones that conduct little.
@@ -197,62 +198,99 @@ def through_others(
         return np.zeros_like(response)
     known = np.maximum(response[tells], 0.0)
     usual = float(known.mean())
-    given = np.full_like(response, usual)
-    given[tells] = known
-    given[short] = _SHORTED * float(known.max())
-    given[~layout.present.ravel()] = 0.0
-    error = np.where(tells, least, np.inf)
-    grids = zip(layout.grid(given), layout.grid(error), strict=True)
-    pads = [_through(*of, usual, held=held) for of in grids]
-    found: Floats = np.stack(pads).reshape(-1)
-    return found
-
-
-def _through(given: Floats, error: Floats, usual: float, *, held: bool) -> Floats:
-    """Return the most that may come through other crossings of a pad, ``[rows, cols]``.
-
-    Args:
-        given: what each reads.
-        error: what it is certain to; infinite: it bounds nothing.
-        usual: what they read on average.
-        held: whether it is known that lines are held.
-    """
-    rows, cols = given.shape
-    found = np.zeros_like(given)
-    whole = np.zeros((rows + cols, rows + cols))
-    cut = whole.copy()
-    together = usual * max(rows, cols)
+    together = usual * max(layout.rows, layout.cols)
     if not together:
-        return found
+        return np.zeros_like(response)
+    every = np.full_like(response, usual)
+    every[tells] = known
+    every[short] = _SHORTED * float(known.max())
+    every[~layout.present.ravel()] = 0.0
+    given = layout.grid(every)
+    error = layout.grid(np.where(tells, least, np.inf))
+    found = np.zeros_like(given)
+    unproven = np.zeros_like(given)
     for _ in range(2):
         own = np.maximum(given - found, 0.0)
-        low, high = np.log(together) + np.log(_LEAKS)
-        while not held and high - low > _PRECISE:
-            middle = (low + high) / 2
-            if (_beside(own, np.exp(middle), whole) > given + error).any():
-                low = middle
-            else:
-                high = middle
-        leak = _HELD * together if held else np.exp(low)
-        found = np.maximum.reduce([found, *(_beside(own, leak, lines) for lines in (whole, cut))])
-        unproven = np.isfinite(error) & (given - error <= CERTAINLY * found)
-        cut[:rows, :rows] = usual * _cut_off(unproven.astype(np.float64))
-        cut[rows:, rows:] = usual * _cut_off(unproven.T.astype(np.float64))
+        leak = _HELD * together
+        if not held:  # one read-out drives all pads
+            leak = max(map(_least_leak, own, given + error, [together] * len(given)))
+        seen = np.where(np.isfinite(error), own, usual)  # of two shorted crossings, one is seen
+        parts = usual * unproven
+        ways = [_ways(*of, leak) for of in zip(own, seen, parts, strict=True)]
+        found = np.maximum(found, np.stack(ways))
+        unproven = np.where(np.isfinite(error) & (given - error <= CERTAINLY * found), 1.0, 0.0)
+    most: Floats = found.reshape(-1)
+    return most
+
+
+def _least_leak(own: Floats, most: Floats, together: float) -> float:
+    """Return the least leakage of a line to ground with which no crossing of a pad would read more.
+
+    Args:
+        own: conductances of the crossings, ``[rows, cols]``.
+        most: what comes to each through others at most, the same.
+        together: what the crossings of a line conduct.
+    """
+    whole = np.zeros((sum(own.shape),) * 2)
+    low, high = np.log(together) + np.log(_LEAKS)
+    while high - low > _PRECISE:
+        middle = (low + high) / 2
+        if (_beside(own, np.exp(middle), whole) > most).any():
+            low = middle
+        else:
+            high = middle
+    return float(np.exp(low))
+
+
+def _ways(own: Floats, seen: Floats, parts: Floats, leak: float) -> Floats:
+    """Return the most that comes through other crossings of a pad, ``[rows, cols]``.
+
+    Args:
+        own: conductances of the crossings, ``[rows, cols]``.
+        seen: the same, without the shorted ones.
+        parts: of those that may lie on a part of a line that is cut off, 0 elsewhere.
+        leak: from each line to ground.
+    """
+    rows = len(own)
+    whole = np.zeros((sum(own.shape),) * 2)
+    cut = whole.copy()
+    cut[:rows, :rows] = _cut_off(parts)
+    cut[rows:, rows:] = _cut_off(parts.T)
+    ways = [_beside(own, leak, lines) for lines in (whole, cut)]
+    ways += [_onto_shorted(seen, leak, parts), _onto_shorted(seen.T, leak, parts.T).T]
+    found: Floats = np.maximum.reduce(ways)
     return found
 
 
-def _cut_off(unproven: Floats) -> Floats:
+def _onto_shorted(conductance: Floats, leak: float, part: Floats) -> Floats:
+    """Return what comes from rows over columns onto the part of a row that is cut off, and by a
+    shorted crossing of it, which nothing shows, to a column, ``[rows, cols]``.
+
+    Args:
+        conductance: of the crossings, ``[rows, cols]``.
+        leak: from each line to ground.
+        part: of the crossings that may lie on a part, 0 elsewhere, ``[rows, cols]``.
+    """
+    reached = conductance / (conductance.sum(axis=0) + leak)  # of the drive, on each column
+    brought = reached @ part.T  # from row i onto the part of row k
+    on_part = (part > 0) & ((part > 0).sum(axis=1, keepdims=True) > 1)
+    found: Floats = (brought[:, :, None] * on_part).max(axis=1)
+    return found
+
+
+def _cut_off(parts: Floats) -> Floats:
     """Return the matrix of conductances between rows, ``[rows, rows]``, through parts of columns
-    that are cut off, in conductances of a crossing.
+    that are cut off.
 
     Such a part joins the rows of its crossings, which do not conduct to the column, and leaks
     nothing.
 
     Args:
-        unproven: 1 where a crossing may not conduct, ``[rows, cols]``.
+        parts: conductance of a crossing that may lie on one, 0 elsewhere, ``[rows, cols]``.
     """
-    each = unproven / np.maximum(unproven.sum(axis=0), 1.0)
-    found: Floats = np.diag(unproven.sum(axis=1)) - each @ unproven.T
+    together = parts.sum(axis=0)
+    shares = np.divide(parts, together, out=np.zeros_like(parts), where=together > 0)
+    found: Floats = np.diag(parts.sum(axis=1)) - shares @ parts.T
     return found
 
 

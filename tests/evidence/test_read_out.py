@@ -112,18 +112,21 @@ def leaking(ohms: float, seed: int) -> tuple[ShortedLine, ...]:
     st.integers(0, 10**6),
     st.sets(cells, max_size=4),
     st.sampled_from([None, 0, 2]),
+    st.sets(cells, max_size=1),
     LEAKS,
     CONDUCTION,
 )
-def test_where_lines_float_none_of_several_is_alive(seed, opens, before, leak, spread):
+def test_where_lines_float_none_of_several_is_alive(seed, opens, before, short, leak, spread):
+    opens = opens - short
     faults = [StuckCell(cell, np.inf) for cell in opens]
+    faults += [StuckCell(cell, 0.0) for cell in short]
     if before is not None:
         faults.append(CutLine(Line(0, "row", 3), before))
         opens = opens | set(LAYOUT.cells_on(Line(0, "row", 3))[before:].tolist())
     circuit = Circuit(LAYOUT, "floating", (*faults, *leaking(leak, seed)))
     found = judge_scan(scan_circuit(circuit, idle_of(spread, seed), seed=seed), LAYOUT)
     assert not found.alive[list(opens)].any()
-    assert blamed(found) <= opens
+    assert blamed(found) <= opens | short
 
 
 @given(st.integers(0, 10**6), loads, cells)

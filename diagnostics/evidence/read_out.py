@@ -225,7 +225,10 @@ def judge_scan(scan: Scan, layout: SensorLayout) -> ReadOut:
 
     Raises:
         ValueError: a scan of another array.
+        TypeError: something else than a scan.
     """
+    if not isinstance(scan, Scan):
+        raise TypeError(f"expected Scan(levels [n], readings [n, D]), got {type(scan).__name__}")
     cells = layout.n_cells
     if scan.readings.shape[1] != cells:
         raise ValueError(

@@ -309,5 +309,7 @@ def test_a_scan_of_another_array_or_of_no_levels_is_refused_in_one_line():
         Scan(np.array([0.0, 3.0]), np.zeros((2, 4)))
     with pytest.raises(ValueError, match=r"levels \[n\] and readings \[n, D\]; got \[2\] and \[3"):
         Scan(np.zeros(2), np.zeros((3, 4)))
+    with pytest.raises(TypeError, match=r"expected Scan\(levels \[n\], readings .* got ndarray"):
+        judge_scan(scan.readings, LAYOUT)
     with pytest.raises(ValueError, match="no frames"):
         Scan.of([])

@@ -101,6 +101,7 @@ def test_a_scan_is_told_with_its_faults_and_is_neither_monitored_nor_lost_frames
     assert events[0].data["tested"] == D
     assert set(session.fault_set) == {7, *LAYOUT.cells_on(Line(0, "row", 4)).tolist()}
     np.testing.assert_allclose(watcher.given, np.arange(30) / RATE)
+    assert set(watcher.diagnosis().fault_set) >= set(session.fault_set)
     again = events_of(session, stream(start=100.0))
     assert [event.kind for event in again] == ["scan"]  # the faults are known
 

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from diagnostics.evidence.read_out import judge_scan, with_scan
 from diagnostics.preprocessing.array_likes import plain_array
 from diagnostics.preprocessing.readings import SEGMENT
 from diagnostics.threads import Worker, one_thread
@@ -22,6 +23,7 @@ from diagnostics.wiring import Line
 if TYPE_CHECKING:
     from diagnostics.decision.result import Diagnosis
     from diagnostics.diagnosis import SelfDiagnosis
+    from diagnostics.evidence.read_out import ReadOut, Scan
     from diagnostics.evidence.stream_state import StreamState
     from diagnostics.faults import Fault
 
@@ -71,8 +73,9 @@ class Monitor:
         self._told_after, self._every = self._pace(0)
         self._worker = Worker()
         self._known: dict[Key, Fault] = {}
-        self._evaluated: Diagnosis | None = None
+        self._evaluated: Diagnosis | None = None  # without the scan, as the next one
         self._settled: Diagnosis | None = None
+        self._read_out: ReadOut | None = None
         self._time: float | None = None
         self._warned = False
 
@@ -133,6 +136,29 @@ class Monitor:
             len(self._new),
         )
 
+    def scan(self, scan: Scan) -> tuple[Fault, ...]:
+        """Take a scan of the read-out for evidence, in place of the one before; return the faults
+        that are new or changed by it, at once.
+
+        Its frames are none of :meth:`update`, and may come before the first of them. A scan that
+        was interrupted tells nothing, and the one before stays. What an earlier scan found and this
+        one does not is told as gone with the next evaluation.
+
+        Raises:
+            ValueError: a scan of another array; it is not taken.
+        """
+        found = judge_scan(scan, self._diagnoser.layout)
+        if not (found.alive | found.broken).any():
+            return ()
+        self._read_out = found
+        changes = []
+        for fault in found.faults:
+            known = self._known.get(_key(fault))
+            self._known[_key(fault)] = fault
+            if known is None or (known.kind, known.cells) != (fault.kind, fault.cells):
+                changes.append(fault)
+        return tuple(changes)
+
     def _pace(self, pieces: int) -> tuple[int, int]:
         """Return after how many frames an evaluation of so many pieces tells what changed, and the
         next one begins."""
@@ -187,12 +213,13 @@ class Monitor:
         return self._changes(diagnosis, final=True)
 
     def diagnosis(self) -> Diagnosis:
-        """Return the diagnosis of all frames so far, as :meth:`SelfDiagnosis.diagnose` does.
+        """Return the diagnosis of all frames so far, with the scan, as
+        :meth:`SelfDiagnosis.diagnose` does.
 
         Raises:
             ValueError: no frame with a reading was received yet.
         """
-        return self._diagnoser.evaluate(self._so_far().stream)
+        return self._with_scan(self._diagnoser.evaluate(self._so_far().stream))
 
     @property
     def faults(self) -> tuple[Fault, ...]:
@@ -203,16 +230,21 @@ class Monitor:
     def evaluated(self) -> Diagnosis | None:
         """The diagnosis of the last evaluation that is complete, without a new one; of the one
         before it where the last one says what was not told yet. None before the first."""
-        return self._settled
+        return None if self._settled is None else self._with_scan(self._settled)
 
-    def _changes(self, diagnosis: Diagnosis, *, final: bool = False) -> tuple[Fault, ...]:
+    def _with_scan(self, diagnosis: Diagnosis) -> Diagnosis:
+        return diagnosis if self._read_out is None else with_scan(diagnosis, self._read_out)
+
+    def _changes(self, evaluated: Diagnosis, *, final: bool = False) -> tuple[Fault, ...]:
         """Take in a complete evaluation; return what it says as the one before it did, and was not
         told yet. ``final``: no further one is needed."""
-        before = diagnosis if final else self._evaluated
-        self._evaluated = diagnosis
-        if before is None:
-            self._settled = None if diagnosis.faults else diagnosis
+        last = evaluated if final else self._evaluated
+        self._evaluated = evaluated
+        if last is None:
+            self._settled = None if evaluated.faults else evaluated
             return ()
+        diagnosis = self._with_scan(evaluated)
+        before = self._with_scan(last)
         told = dict(self._known)
         changes = []
         for fault in diagnosis.faults:
@@ -236,8 +268,8 @@ class Monitor:
             elif current.issuperset(fault.cells):  # told with their wire: none has recovered
                 del told[key]
         self._known = told
-        if found == told.keys() or self._settled is not before:
-            self._settled = diagnosis
+        if found == told.keys() or self._settled is not last:
+            self._settled = evaluated
         return tuple(changes)
 
 

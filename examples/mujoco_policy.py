@@ -1,5 +1,5 @@
 """A policy that needs touch, and what its repairs are worth: python examples/mujoco_policy.py
-[--quick] [--out FOLDER]
+[--quick] [--seeds 2] [--out FOLDER]
 
 Two policies learn the task of ``mujoco_lift.py`` from demonstrations: a small transformer that
 gives chunks of actions (as ACT: Zhao, Kumar, Levine and Finn 2023, without its latent variable),
@@ -13,9 +13,11 @@ trained anew on the healthy cells as the first time; and of the policy with mask
 nothing done and with F masked. All see the same objects. Intervals are Wilson's, of 95 %. Touch
 that reads 0 everywhere shows whether the task needs it. A head may be better than what the policy
 ends with; without a fault it shows how much of a gain is no repair. Training anew has other initial
-weights, and without a fault shows how much they matter.
+weights, and without a fault shows how much they matter. Each seed draws demonstrations, initial
+weights, F and objects of its own.
 
-``OUT/results.csv`` gets a line for each row as it is found; ``OUT/results.md`` is the table.
+``OUT/results.csv`` gets a line for each row as it is found; ``OUT/results.md`` is the table, over
+all seeds.
 """
 
 from __future__ import annotations
@@ -208,8 +210,9 @@ def set_to(cells: FaultSet, value: float) -> Callable[[Floats], Floats]:
 
 @dataclass(frozen=True)
 class Row:
-    """A line of the table: how the episodes under a damage ended with a policy."""
+    """How the episodes of a seed under a damage ended with a policy."""
 
+    seed: int
     damage: str
     policy: str
     seconds: float
@@ -220,21 +223,24 @@ class Row:
         """Number of episodes that succeeded."""
         return self.outcomes.count("lifted")
 
-    @property
-    def interval(self) -> tuple[float, float]:
-        """Wilson's interval of the success rate."""
-        low, high = proportion_confint(self.lifted, len(self.outcomes), method="wilson")
-        return float(low), float(high)
-
     def cells(self) -> list[str]:
         """Return the line of the CSV file."""
         ended = [self.outcomes.count(name) for name in ENDS]
-        shares = [f"{share:.3f}" for share in (self.lifted / len(self.outcomes), *self.interval)]
-        return [self.damage, self.policy, *shares, *map(str, ended), f"{self.seconds:.1f}"]
+        shares = [f"{share:.3f}" for share in success([self])]
+        about = [str(self.seed), self.damage, self.policy]
+        return [*about, *shares, *map(str, ended), f"{self.seconds:.1f}"]
+
+
+def success(rows: Sequence[Row]) -> tuple[float, float, float]:
+    """Return the success rate over rows, and Wilson's interval of it."""
+    lifted = sum(row.lifted for row in rows)
+    count = sum(len(row.outcomes) for row in rows)
+    low, high = proportion_confint(lifted, count, method="wilson")
+    return lifted / count, float(low), float(high)
 
 
 ENDS = ("lifted", "dropped", "crushed", "not lifted")
-HEADS = ("damage", "policy", "success", "low", "high", *ENDS, "seconds of the repair")
+HEADS = ("seed", "damage", "policy", "success", "low", "high", *ENDS, "seconds of the repair")
 REPAIRS: tuple[Method, ...] = ("fill", "head", "finetune")
 
 
@@ -309,7 +315,7 @@ class Study:
     def tried(self, damage: Damage, what: str, policy: Policy, seconds: float = 0.0) -> Row:
         """Return the line of a policy under a damage."""
         outcomes = rollouts(policy, self.seeds, damage.faults)
-        return Row(damage.name, what, seconds, tuple(outcomes))
+        return Row(self.seed, damage.name, what, seconds, tuple(outcomes))
 
 
 def prepared(count: int, epochs: int, episodes: int, seed: int) -> Study:
@@ -334,43 +340,48 @@ def main() -> None:
     parser.add_argument("--demonstrations", type=int, default=150)
     parser.add_argument("--epochs", type=int, default=50, help="of a training")
     parser.add_argument("--episodes", type=int, default=50, help="for each line of the table")
-    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--seeds", type=int, default=2, help="of everything; 0 is the first")
     parser.add_argument("--out", type=Path, default=Path("policy"), help="folder for the table")
     parser.add_argument("--quick", action="store_true", help="seconds: too few of everything")
     args = parser.parse_args()
     if args.quick:
-        args.demonstrations, args.epochs, args.episodes = 12, 1, 2
+        args.demonstrations, args.epochs, args.episodes, args.seeds = 12, 1, 2, 1
     args.out.mkdir(parents=True, exist_ok=True)
-    study = prepared(args.demonstrations, args.epochs, args.episodes, args.seed)
     rows = []
     with (args.out / "results.csv").open("w", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(HEADS)
-        for row in study.rows():
-            rows.append(row)
-            writer.writerow(row.cells())
-            file.flush()
-            (args.out / "results.md").write_text(table(rows))
-            print(*row.cells(), flush=True)
+        for seed in range(args.seeds):
+            for row in prepared(args.demonstrations, args.epochs, args.episodes, seed).rows():
+                rows.append(row)
+                writer.writerow(row.cells())
+                file.flush()
+                (args.out / "results.md").write_text(table(rows))
+                print(*row.cells(), flush=True)
 
 
 def table(rows: Sequence[Row]) -> str:
     """Return the table as Markdown: damages down, policies across."""
     names = list(dict.fromkeys(row.damage for row in rows))
     policies = list(dict.fromkeys(row.policy for row in rows))
-    found = {(row.damage, row.policy): row for row in rows}
+    found: dict[tuple[str, str], list[Row]] = {}
+    for row in rows:
+        found.setdefault((row.damage, row.policy), []).append(row)
     lines = [f"| damage | {' | '.join(policies)} |", "|---" * (len(policies) + 1) + "|"]
     for name in names:
-        cells = [_cell(found.get((name, policy))) for policy in policies]
+        cells = [_cell(found.get((name, policy), [])) for policy in policies]
         lines.append(f"| {name} | {' | '.join(cells)} |")
     return "\n".join(lines) + "\n"
 
 
-def _cell(row: Row | None) -> str:
-    if row is None:
+def _cell(rows: Sequence[Row]) -> str:
+    """Return the success rate, its interval, and that of each seed where there are several."""
+    if not rows:
         return ""
-    low, high = row.interval
-    return f"{row.lifted / len(row.outcomes):.2f} ({low:.2f} to {high:.2f})"
+    share, low, high = success(rows)
+    text = f"{share:.2f} ({low:.2f} to {high:.2f})"
+    each = [f"{success([row])[0]:.2f}" for row in rows]
+    return text if len(each) == 1 else f"{text}: {', '.join(each)}"
 
 
 if __name__ == "__main__":

@@ -3,15 +3,18 @@ on the circuit of an array.
 
     python examples/read_out_bench.py [--arrays 200] [--small]
 
-The last rows are of a read-out that lets all lines float which it does not select.
+The first rows are of scans that do not state that lines are held, and of the same ones stating it;
+the last ones of a read-out that lets all lines float which it does not select.
 
 Each array has two open crossings, a shorted one of up to 1 kiloohm, and every second one a row or
 column that is cut somewhere. Preload, leakage to ground (1 megaohm to 1 gigaohm) and the noise of
-the converter (12 bits) differ from array to array.
+the converter (12 bits) differ from array to array; where lines float, leakage differs in addition
+by a factor of ten from line to line.
 """
 
 import argparse
 from collections import Counter
+from dataclasses import replace
 
 import numpy as np
 
@@ -22,17 +25,21 @@ from diagnostics.simulation.scan import scan_circuit
 
 SIZES = ((16, 16), (11, 10))
 READ_OUTS = {"grounded": 100.0, "virtual ground": 1.0}  # ohms of the divider
-LEAKS = {"1 megaohm to 1 gigaohm": (6, 9), "0.1 to 1 megaohm": (5, 6)}  # where lines float
+LEAKS = {  # where lines float
+    "1 megaohm to 1 gigaohm": (6, 9),
+    "0.1 to 1 megaohm": (5, 6),
+    "1 to 100 kiloohm": (3, 5),
+}
 PRELOAD = 0.02  # newton at most, of 5
 
 
-def scanned(circuit: Circuit, rng: np.random.Generator) -> ReadOut:
-    """Return what a scan says of an untouched array."""
+def scanned(circuit: Circuit, rng: np.random.Generator, *, stated: bool | None = None) -> ReadOut:
+    """Return what a scan says of an untouched array; ``stated``: whether lines are held."""
     layout = circuit.layout
     idle = rng.uniform(0, PRELOAD, layout.n_cells)
     noise = float(rng.choice([0.5, 1.0, 2.0]))
     scan = scan_circuit(circuit, idle, noise=noise, seed=int(rng.integers(1 << 30)))
-    return judge_scan(scan, layout)
+    return judge_scan(replace(scan, holds_lines=stated), layout)
 
 
 def broken(layout: SensorLayout, rng: np.random.Generator, *, cut: bool) -> tuple:
@@ -53,18 +60,20 @@ def broken(layout: SensorLayout, rng: np.random.Generator, *, cut: bool) -> tupl
     return tuple(faults), is_open, is_short
 
 
-def crossings(layout: SensorLayout, load: float, arrays: int) -> Counter:
-    """Return counts of crossings over many arrays."""
+def crossings(layout: SensorLayout, load: float, arrays: int, *, stated: bool | None) -> Counter:
+    """Return counts of crossings over many arrays whose lines are held."""
     rng = np.random.default_rng(0)
     count: Counter = Counter()
     for i in range(arrays):
         faults, is_open, is_short = broken(layout, rng, cut=i % 2 == 0)
         leak = 10 ** rng.uniform(6, 9)
-        found = scanned(Circuit(layout, faults=faults, load_ohms=load, leak_ohms=leak), rng)
+        circuit = Circuit(layout, faults=faults, load_ohms=load, leak_ohms=leak)
+        found = scanned(circuit, rng, stated=stated)
         told = np.isin(np.arange(layout.n_cells), [c for f in found.faults for c in f.cells])
         healthy = ~is_open & ~is_short
         count["open"] += int(is_open.sum())
         count["open found"] += int((told & is_open).sum())
+        count["open alive"] += int((found.alive & (is_open | is_short)).sum())
         count["short"] += int(is_short.sum())
         count["short found"] += int((told & is_short).sum())
         count["blamed"] += int((told & healthy).sum())
@@ -100,7 +109,9 @@ def floating(layout: SensorLayout, leaks: tuple[float, float], arrays: int) -> C
     for i in range(arrays):
         faults, is_open, is_short = broken(layout, rng, cut=i % 2 == 0)
         leak = 10 ** rng.uniform(*leaks)
-        found = scanned(Circuit(layout, "floating", faults, leak_ohms=leak), rng)
+        lines = [line for line in layout.lines if line.kind in ("row", "column")]
+        more = [ShortedLine(line, "ground", leak * 10 ** rng.uniform(0, 1)) for line in lines]
+        found = scanned(Circuit(layout, "floating", (*faults, *more)), rng)
         told = np.isin(np.arange(layout.n_cells), [c for f in found.faults for c in f.cells])
         count["open"] += int(is_open.sum())
         count["alive"] += int((found.alive & is_open).sum())
@@ -118,13 +129,15 @@ def main() -> None:
     for rows, cols in SIZES:
         layout = SensorLayout(1, rows, cols)
         for name, load in READ_OUTS.items():
-            count = crossings(layout, load, arrays)
-            print(
-                f"{rows} x {cols}, {name}, {arrays} arrays: open"
-                f" {count['open found']}/{count['open']}, short"
-                f" {count['short found']}/{count['short']}, healthy blamed {count['blamed']},"
-                f" untested {count['untested']} of {count['cells']} cells"
-            )
+            for stated in (None, True):
+                count = crossings(layout, load, arrays, stated=stated)
+                print(
+                    f"{rows} x {cols}, {name}, {'' if stated else 'not '}stated, {arrays} arrays:"
+                    f" open {count['open found']}/{count['open']}, short"
+                    f" {count['short found']}/{count['short']}, of both called ALIVE"
+                    f" {count['open alive']}, healthy blamed {count['blamed']}, untested"
+                    f" {count['untested']} of {count['cells']} cells"
+                )
             for text in lines(layout, load, max(arrays // 10, 4)):
                 print(f"    line {text}")
         for name, leaks in LEAKS.items():

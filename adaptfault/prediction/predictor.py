@@ -8,7 +8,7 @@ import logging
 import os
 import threading
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from time import monotonic
 from typing import TYPE_CHECKING, Any
@@ -24,7 +24,7 @@ from adaptfault.inspection.converter_range import within_range
 from adaptfault.models.accumulation import ContactDecision
 from adaptfault.prediction.inference import Inference
 from adaptfault.prediction.reading import Reading
-from diagnostics import Diagnosis, FaultSet, Monitor, SelfDiagnosis, SensorLayout
+from diagnostics import Diagnosis, Fault, FaultSet, Monitor, Scan, SelfDiagnosis, SensorLayout
 
 if TYPE_CHECKING:
     from adaptfault.bundle.bundle import Bundle
@@ -263,6 +263,23 @@ class Predictor:
             values,
             classes,
         )
+
+    def scan(self, scan: Scan) -> tuple[Fault, ...]:
+        """Take a scan of the read-out for evidence of the monitor, as
+        :meth:`diagnostics.Monitor.scan`.
+
+        Raises:
+            ValueError: a scan of another array; it is not taken.
+        """
+        source = self._running.version.source
+        if scan.readings.shape[1] == len(source):
+            scan = replace(scan, readings=scan.readings[:, source])
+        return self._monitor.scan(scan)
+
+    @property
+    def faults(self) -> tuple[Fault, ...]:
+        """The faults that the monitor told and are not gone, as in :class:`Reading`."""
+        return self._monitor.faults
 
     def _new_decision(self) -> ContactDecision | None:
         """Return a decision for the running version, without contact; None where the predictor does

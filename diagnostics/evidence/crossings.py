@@ -1,18 +1,27 @@
-"""How the crossings of an array answer a scan of its read-out, and whether current can reach them
-on other ways than their own.
+"""How the crossings of an array answer a scan of its read-out, and how much of it may come through
+other crossings.
 
 A read-out that lets the lines float which it neither drives nor reads sends current through other
-crossings, so that an open one answers, too. The resistances R between a row and a column are then
-those of one network, and such resistances are a metric (Klein and Randic 1993)::
+crossings, so that an open one answers, too. Two levels do not tell: resistances answer in
+proportion on any way. What tells is that all crossings share the ways through others. With the
+conductances G of the crossings, and L from each line to ground, a crossing reads (Kirchhoff; Z is
+the inverse of the matrix of G and L)::
 
-    R_ij <= R_il + R_kl + R_kj        for all rows k and columns l
+    T_ij = Z_ij / (Z_ii Z_jj - Z_ij^2) = G_ij + S_ij     S: through others, the more the less L is
 
-A crossing that conducts less than three others in series refutes that its lines float. Leakage to
-ground takes from the current through others, so that open crossings conduct less, too: several
-crossings have to, without those of one line, which may be cut, or one that does not conduct at all.
+L is unknown: large where lines are held, small where they float; one read-out drives all pads. But
+no S is more than what its crossing reads, so that one which reads little bounds L from below, and S
+of all others from above. G is taken for what they read, then for what is left of it without S, and
+the larger S counts. A crossing conducts for certain if it reads more than :data:`CERTAINLY` times
+S. So a silent one proves that others conduct, and an open one, which reads S alone, is left
+untested.
 
-Where lines float, and leak to ground more than ten times as well as an untouched crossing conducts,
-open ones may still pass for held ones that conduct little (``examples/read_out_bench.py``).
+The part of a line beyond a cut leaks nothing, and joins the lines that cross it. Crossings that do
+not conduct for certain may lie on one, and one of them may be shorted. Where a crossing is shorted,
+it brings current also to lines that are held.
+
+Not covered: leakages of lines that differ by more than a factor of ten; some open crossings may
+then pass for held ones that conduct little.
 """
 
 from __future__ import annotations
@@ -35,13 +44,18 @@ REPEATS = 4
 STANDS = 5.0
 """Standard errors that are no noise."""
 
+CERTAINLY = 3.0
+"""Times what may come through others: it covers leakages that differ by a factor of ten."""
+
 _LEAST_SPREAD = 0.5  # standard deviation of log r of healthy crossings
 _IN_PROPORTION = 0.25  # ratio - 1
 _FAINT = 0.03  # of the usual response: a line on ground
 _FEWEST = 3  # crossings of such a line
 _OF_MEDIAN = 1.25  # standard error of a median, in those of a mean
-_REFUTING = 0.04  # share of the crossings that conduct less than others in series
-_FEWEST_REFUTING = 5
+_SHORTED = 1e3  # times the highest response
+_LEAKS = (1e-4, 1e6)  # from each line, times what its crossings conduct together
+_HELD = 100.0  # of a line that is held, the same
+_PRECISE = 0.01  # of the logarithm of the leakage
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -168,39 +182,136 @@ class Healthy:
         return self.usual * float(min(_FAINT, np.exp(-by_chance)))
 
 
-def holds_lines(
-    response: Floats, least: Floats, answers: Mask, silent: Mask, layout: SensorLayout
-) -> bool:
-    """Return whether crossings show that lines which are not selected do not float.
-
-    False says nothing where crossings conduct alike: three of them in series conduct less.
+def through_others(
+    response: Floats, least: Floats, tells: Mask, short: Mask, layout: SensorLayout, *, held: bool
+) -> Floats:
+    """Return the most that may come through other crossings, ``[D]``.
 
     Args:
-        response: of each crossing, ``[D]``.
+        response: of each crossing, ``[D]``; NaN: not measured.
         least: what it is certain to, ``[D]``.
-        answers, silent: bool ``[D]``.
+        tells, short: bool ``[D]``; what tells nothing conducts as the others on average.
         layout: the array.
+        held: whether it is known that lines are held.
     """
-    if not layout.is_matrix:
-        return True
-    known = np.where(answers, np.maximum(response - least, 0.0), 0.0)
-    weaker = response + least < _through_three(layout.grid(known)).reshape(-1)
-    if (weaker & silent).any():
-        return True
-    refuting = layout.grid(weaker & answers)
-    of_one_line = max(refuting.sum(axis=2).max(), refuting.sum(axis=1).max())
-    needed = max(_FEWEST_REFUTING, _REFUTING * int(answers.sum()))
-    return bool(refuting.sum() - of_one_line >= needed)
+    if not layout.is_matrix or not tells.any():
+        return np.zeros_like(response)
+    known = np.maximum(response[tells], 0.0)
+    usual = float(known.mean())
+    together = usual * max(layout.rows, layout.cols)
+    if not together:
+        return np.zeros_like(response)
+    every = np.full_like(response, usual)
+    every[tells] = known
+    every[short] = _SHORTED * float(known.max())
+    every[~layout.present.ravel()] = 0.0
+    given = layout.grid(every)
+    error = layout.grid(np.where(tells, least, np.inf))
+    found = np.zeros_like(given)
+    unproven = np.zeros_like(given)
+    for _ in range(2):
+        own = np.maximum(given - found, 0.0)
+        leak = _HELD * together
+        if not held:  # one read-out drives all pads
+            leak = max(map(_least_leak, own, given + error, [together] * len(given)))
+        seen = np.where(np.isfinite(error), own, usual)  # of two shorted crossings, one is seen
+        parts = usual * unproven
+        ways = [_ways(*of, leak) for of in zip(own, seen, parts, strict=True)]
+        found = np.maximum(found, np.stack(ways))
+        unproven = np.where(np.isfinite(error) & (given - error <= CERTAINLY * found), 1.0, 0.0)
+    most: Floats = found.reshape(-1)
+    return most
 
 
-def _through_three(conductance: Floats) -> Floats:
-    """Return what the best three crossings in series conduct that lead from a row to a column, each
-    ``[pads, rows, cols]``."""
-    ohms = np.full_like(conductance, np.inf)
-    np.divide(1.0, conductance, out=ohms, where=conductance > 0)
-    best = np.empty_like(ohms)
-    for pad, one in enumerate(ohms):
-        between = (one[:, :, None] + one.T[None]).min(axis=1)  # of two rows, by a column
-        best[pad] = (between[:, :, None] + one[None]).min(axis=1)
-    found: Floats = 1 / best
+def _least_leak(own: Floats, most: Floats, together: float) -> float:
+    """Return the least leakage of a line to ground with which no crossing of a pad would read more.
+
+    Args:
+        own: conductances of the crossings, ``[rows, cols]``.
+        most: what comes to each through others at most, the same.
+        together: what the crossings of a line conduct.
+    """
+    whole = np.zeros((sum(own.shape),) * 2)
+    low, high = np.log(together) + np.log(_LEAKS)
+    while high - low > _PRECISE:
+        middle = (low + high) / 2
+        if (_beside(own, np.exp(middle), whole) > most).any():
+            low = middle
+        else:
+            high = middle
+    return float(np.exp(low))
+
+
+def _ways(own: Floats, seen: Floats, parts: Floats, leak: float) -> Floats:
+    """Return the most that comes through other crossings of a pad, ``[rows, cols]``.
+
+    Args:
+        own: conductances of the crossings, ``[rows, cols]``.
+        seen: the same, without the shorted ones.
+        parts: of those that may lie on a part of a line that is cut off, 0 elsewhere.
+        leak: from each line to ground.
+    """
+    rows = len(own)
+    whole = np.zeros((sum(own.shape),) * 2)
+    cut = whole.copy()
+    cut[:rows, :rows] = _cut_off(parts)
+    cut[rows:, rows:] = _cut_off(parts.T)
+    ways = [_beside(own, leak, lines) for lines in (whole, cut)]
+    ways += [_onto_shorted(seen, leak, parts), _onto_shorted(seen.T, leak, parts.T).T]
+    found: Floats = np.maximum.reduce(ways)
+    return found
+
+
+def _onto_shorted(conductance: Floats, leak: float, part: Floats) -> Floats:
+    """Return what comes from rows over columns onto the part of a row that is cut off, and by a
+    shorted crossing of it, which nothing shows, to a column, ``[rows, cols]``.
+
+    Args:
+        conductance: of the crossings, ``[rows, cols]``.
+        leak: from each line to ground.
+        part: of the crossings that may lie on a part, 0 elsewhere, ``[rows, cols]``.
+    """
+    reached = conductance / (conductance.sum(axis=0) + leak)  # of the drive, on each column
+    brought = reached @ part.T  # from row i onto the part of row k
+    on_part = (part > 0) & ((part > 0).sum(axis=1, keepdims=True) > 1)
+    found: Floats = (brought[:, :, None] * on_part).max(axis=1)
+    return found
+
+
+def _cut_off(parts: Floats) -> Floats:
+    """Return the matrix of conductances between rows, ``[rows, rows]``, through parts of columns
+    that are cut off.
+
+    Such a part joins the rows of its crossings, which do not conduct to the column, and leaks
+    nothing.
+
+    Args:
+        parts: conductance of a crossing that may lie on one, 0 elsewhere, ``[rows, cols]``.
+    """
+    together = parts.sum(axis=0)
+    shares = np.divide(parts, together, out=np.zeros_like(parts), where=together > 0)
+    found: Floats = np.diag(parts.sum(axis=1)) - shares @ parts.T
+    return found
+
+
+def _beside(conductance: Floats, leak: float, cut: Floats) -> Floats:
+    """Return what comes through other crossings, ``[rows, cols]``.
+
+    Args:
+        conductance: of the crossings, ``[rows, cols]``.
+        leak: from each line to ground.
+        cut: matrix of the conductances between lines, ``[rows + cols, rows + cols]``.
+    """
+    rows = len(conductance)
+    matrix = np.block(
+        [
+            [np.diag(conductance.sum(axis=1)), -conductance],
+            [-conductance.T, np.diag(conductance.sum(axis=0))],
+        ]
+    )
+    inverse = np.linalg.inv(matrix + cut + leak * np.eye(len(matrix)))
+    own = np.diag(inverse)
+    between = inverse[:rows, rows:]
+    read = between / (own[:rows, None] * own[rows:] - between**2)
+    found: Floats = np.maximum(read - conductance, 0.0)
     return found

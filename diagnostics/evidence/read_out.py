@@ -20,13 +20,14 @@ shorted: at the low level the full scale of a cell reads half of the converter's
 that saturates at all levels is on a column that is held at the supply; what has no response of its
 own but a residue is on one, too. A line on ground answers faintly: less than 3 % of the usual
 response in the median of its crossings. The line cover (:mod:`diagnostics.decision.line_cover`)
-names lines. Shorted crossings join others in parallel: these tell nothing.
+names lines. Shorted crossings join others in parallel, and through the part of a line that is cut
+off: these tell nothing.
 
 Not detected: what leaves a crossing conducting, as a worn, late or clamped cell, or two lines that
 are joined; a line of which all crossings are shorted or open only under load. A line that is cut
 and one that lies on ground look alike. Where lines that are not selected float, current through
-other crossings hides open ones: unless crossings refute that (:func:`holds_lines`), or the scan
-states it, those that answer are neither ALIVE nor open.
+other crossings hides open ones: unless the scan states that lines are held, a crossing that answers
+no more than others may bring it (:mod:`diagnostics.evidence.crossings`) is neither ALIVE nor open.
 """
 
 from __future__ import annotations
@@ -42,15 +43,16 @@ from scipy.special import expit, logit
 from diagnostics.decision.line_cover import Cause, solve
 from diagnostics.decision.result import Diagnosis
 from diagnostics.evidence.crossings import (
+    CERTAINLY,
     REPEATS,
     STANDS,
     TOP,
     Answer,
     Healthy,
     Level,
-    holds_lines,
     in_parallel,
     on_faint_lines,
+    through_others,
 )
 from diagnostics.faults import Fault, FaultKind
 from diagnostics.layout import SensorLayout
@@ -61,9 +63,8 @@ _CLEARLY = 4.0  # times the least answer
 _RESIDUE = 0.02  # of the usual response: a residue of a line, not of the converter
 _LOADED = 10.0  # times the usual response: as under load
 _MAY_FLOAT = (
-    "nothing shows that the lines which are not selected are held, and where they float an open"
-    " crossing answers, too: those that answer stay untested; if they are held, state --lines-held,"
-    " or Scan(..., holds_lines=True)"
+    "{} crossings answer no more than open ones may where lines float that are not selected: they"
+    " stay untested; if the lines are held, state --lines-held, or Scan(..., holds_lines=True)"
 )
 
 Floats = NDArray[np.float64]
@@ -162,7 +163,7 @@ class ReadOut:
         """One fault a cause: a line, or a crossing."""
         silent = self.open | self.held
         certain = silent & (self.evidence >= _OPEN)
-        others = self.alive | self.short
+        others = self.short | ((self.response > self.least) & ~silent)
         causes = list(solve(certain, silent, others, self.evidence, self.layout))
         shorted = [Cause(None, (c,), (c,), 1.0) for c in np.flatnonzero(self.short).tolist()]
         return tuple(self._fault(cause) for cause in [*causes, *shorted] if cause.proven)
@@ -224,7 +225,10 @@ def judge_scan(scan: Scan, layout: SensorLayout) -> ReadOut:
 
     Raises:
         ValueError: a scan of another array.
+        TypeError: something else than a scan.
     """
+    if not isinstance(scan, Scan):
+        raise TypeError(f"expected Scan(levels [n], readings [n, D]), got {type(scan).__name__}")
     cells = layout.n_cells
     if scan.readings.shape[1] != cells:
         raise ValueError(
@@ -347,11 +351,11 @@ def _judged(
     least = STANDS * answer.error
     answers = tells & (answer.response > least)
     silent = tells & (np.abs(answer.response) <= least)
-    if held is None:
-        held = holds_lines(answer.response, least, answers, silent, layout)
+    through = through_others(answer.response, least, tells, short, layout, held=held is True)
+    direct = answers & (answer.response - least > CERTAINLY * through) & (held is not False)
     usual = 0.0
     faint = np.zeros_like(tells)
-    evidence = np.where(answers & held, -CERTAIN_RATIO, 0.0)
+    evidence = np.where(direct, -CERTAIN_RATIO, 0.0)
     if answers.sum() >= MAJORITY * measured.sum() > 0:
         healthy = Healthy.of(answer.response[answers])
         usual = healthy.usual
@@ -361,6 +365,8 @@ def _judged(
     no_answer = silent | faint
     at_supply = no_answer & (zero.mean > STANDS * zero.error + _RESIDUE * usual)
     conducts = answers & answer.in_proportion & ~faint & (usual > 0)
+    alive = conducts & direct
+    doubted = 0 if held else int((conducts & ~alive).sum())
     certain = short | everywhere | faint
     return ReadOut(
         layout,
@@ -372,9 +378,9 @@ def _judged(
         open=no_answer & ~at_supply,
         short=short,
         held=everywhere | at_supply,
-        alive=conducts & held,
+        alive=alive,
         under_load=int((conducts & (answer.response > _LOADED * usual)).sum()),
-        incomplete="" if held or not conducts.any() else _MAY_FLOAT,
+        incomplete=_MAY_FLOAT.format(doubted) if doubted else "",
     )
 
 

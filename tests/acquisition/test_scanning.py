@@ -15,7 +15,7 @@ from adaptfault.acquisition import (
 )
 from adaptfault.acquisition.ordering import Frame
 from adaptfault.acquisition.scanning import Scans
-from diagnostics import SensorLayout
+from diagnostics import Monitor, SelfDiagnosis, SensorLayout
 from diagnostics.simulation.circuit import Circuit, CutLine, StuckCell
 from diagnostics.simulation.scan import scan_circuit
 from diagnostics.wiring import Line
@@ -29,20 +29,16 @@ SCAN = scan_circuit(
 )
 
 
-class Watcher:
-    """What a session asks: it notes what it is given, and says nothing."""
-
-    layout = LAYOUT
-    evaluated = None
+class Watcher(Monitor):
+    """Notes which frames it is given."""
 
     def __init__(self):
+        super().__init__(SelfDiagnosis(LAYOUT))
         self.given = []
 
-    def stream(self, frame, time=None):
-        from types import SimpleNamespace
-
+    def update(self, frame, time=None):
         self.given.append(time)
-        return SimpleNamespace(label=None, events=(), faults=(), probabilities=None)
+        return super().update(frame, time)
 
 
 def stream(scan=SCAN, before=5, after=25, start=0.0):
@@ -105,6 +101,7 @@ def test_a_scan_is_told_with_its_faults_and_is_neither_monitored_nor_lost_frames
     assert events[0].data["tested"] == D
     assert set(session.fault_set) == {7, *LAYOUT.cells_on(Line(0, "row", 4)).tolist()}
     np.testing.assert_allclose(watcher.given, np.arange(30) / RATE)
+    assert set(watcher.diagnosis().fault_set) >= set(session.fault_set)
     again = events_of(session, stream(start=100.0))
     assert [event.kind for event in again] == ["scan"]  # the faults are known
 

@@ -17,6 +17,7 @@ from diagnostics import (
     FaultSet,
     Line,
     Monitor,
+    Scan,
     SelfDiagnosis,
     SensorLayout,
     bridge,
@@ -25,6 +26,8 @@ from diagnostics import (
     line_fault,
     lose_frames,
 )
+from diagnostics.simulation.circuit import Circuit, CutLine, StuckCell
+from diagnostics.simulation.scan import scan_circuit
 
 LAYOUT = SensorLayout.paper()
 COLD = SelfDiagnosis(LAYOUT)
@@ -479,3 +482,85 @@ def test_a_thread_that_outlives_the_main_thread_is_told_the_same(fitted, log, mi
     assert (done.returncode, done.stderr) == (0, "")
     expected = [f"{i} {fault.cells}" for i, fault in watched(fitted, frames)[1]]
     assert done.stdout.splitlines() == expected != []
+
+
+ROW = Line(1, "row", 4)
+BROKEN = (StuckCell(7, np.inf), CutLine(ROW))
+
+
+def scan_of(*faults) -> Scan:
+    """Return a scan of the untouched array, with lines held."""
+    scan = scan_circuit(Circuit(LAYOUT, faults=faults), np.full(LAYOUT.n_cells, 0.01))
+    return Scan(scan.levels, scan.readings, holds_lines=True)
+
+
+def cells_of(faults: tuple[Fault, ...]) -> set[int]:
+    return {cell for fault in faults for cell in fault.cells}
+
+
+@pytest.mark.usefixtures("seldom_evaluated")
+@pytest.mark.parametrize("at", [0, 50, 400, 970])
+def test_with_a_scan_it_gives_the_diagnosis_of_all_frames_and_the_scan(fitted, log, middle, at):
+    frames = inject(log, mixes(middle)["cells"], LAYOUT, seed=0, dither=0.004)[:970]
+    scan = scan_of(*BROKEN)
+    for diagnoser in (fitted, COLD):
+        monitor = Monitor(diagnoser)
+        told(monitor, frames[:at])
+        monitor.scan(scan)
+        told(monitor, frames[at:])
+        expected = diagnoser.diagnose(frames, scan=scan)
+        assert without_recordings(monitor.diagnosis()) == without_recordings(expected)
+        assert set(expected.fault_set) >= {7, *LAYOUT.cells_on(ROW).tolist()}
+
+
+def test_what_a_scan_finds_is_told_at_once_and_once(fitted, log):
+    monitor = Monitor(fitted)
+    scan = scan_of(*BROKEN)
+    expected = {7, *LAYOUT.cells_on(ROW).tolist()}
+    assert cells_of(monitor.scan(scan)) == expected
+    assert monitor.scan(scan) == ()
+    assert not {cell for _, fault in told(monitor, log[:400]) for cell in fault.cells}
+    assert cells_of(monitor.faults) == expected
+    assert monitor.evaluated is not None
+    assert set(monitor.evaluated.fault_set) == expected
+    assert monitor.flush() == ()
+
+
+def test_what_the_next_scan_does_not_find_is_told_as_gone(fitted, log):
+    monitor = Monitor(fitted)
+    monitor.scan(scan_of(*BROKEN))
+    told(monitor, log[:200])
+    assert monitor.scan(scan_of(BROKEN[0])) == ()
+    gone = told(monitor, log[200:400])
+    assert [(fault.line, fault.probability) for _, fault in gone] == [(ROW, 0.0)]
+    assert cells_of(monitor.faults) == {7}
+    assert set(monitor.diagnosis().fault_set) == {7}
+
+
+def test_a_scan_that_was_interrupted_leaves_the_one_before(fitted, log):
+    monitor = Monitor(fitted)
+    whole = scan_of(*BROKEN)
+    monitor.scan(whole)
+    told(monitor, log[:40])
+    before = monitor.diagnosis()
+    assert monitor.scan(Scan(whole.levels[:20], whole.readings[:20], holds_lines=True)) == ()
+    assert monitor.diagnosis().to_dict() == before.to_dict()
+
+
+def test_a_scan_of_another_array_is_refused_in_one_line_and_changes_nothing(fitted, log):
+    monitor = Monitor(fitted)
+    told(monitor, log[:40])
+    before = monitor.diagnosis().to_dict()
+    with pytest.raises(ValueError, match=r"a scan of 4 cells, but the array has 220") as caught:
+        monitor.scan(Scan(np.array([0.0, 1.0]), np.zeros((2, 4))))
+    assert "\n" not in str(caught.value)
+    assert monitor.diagnosis().to_dict() == before
+
+
+def test_a_copy_of_a_monitor_holds_the_scan(fitted, log):
+    monitor = Monitor(fitted)
+    monitor.scan(scan_of(*BROKEN))
+    told(monitor, log[:40])
+    twin = pickle.loads(pickle.dumps(monitor))
+    assert twin.diagnosis().to_dict() == monitor.diagnosis().to_dict()
+    assert cells_of(twin.faults) == cells_of(monitor.faults)

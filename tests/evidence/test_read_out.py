@@ -86,15 +86,14 @@ def test_a_line_on_the_supply_or_on_ground_is_one_fault_and_no_other_cell_is_bla
     assert found.alive.sum() == LAYOUT.n_cells - len(fault.cells)
 
 
-LEAKS = st.sampled_from([1e12, 1e8, 1e7, 3e6, 1e6])
+LEAKS = st.sampled_from([1e12, 1e8, 1e7, 1e6, 3e5, 1e5, 3e4, 1e4, 1e3])
 CONDUCTION = st.sampled_from([0.0, 0.3, 1.0])  # deviation of its logarithm
 
 
 @given(st.integers(0, 10**6), cells, LEAKS, CONDUCTION, loads, st.sampled_from([0.5, 2.0]))
 def test_where_lines_float_no_open_crossing_is_alive(seed, cell, leak, spread, load, noise):
-    circuit = Circuit(
-        LAYOUT, "floating", (StuckCell(cell, np.inf),), load_ohms=load, leak_ohms=leak
-    )
+    faults = (StuckCell(cell, np.inf), *leaking(leak, seed))
+    circuit = Circuit(LAYOUT, "floating", faults, load_ohms=load)
     idle = np.clip(idle_of(spread, seed), 0.001, None)
     found = judge_scan(scan_circuit(circuit, idle, seed=seed, noise=noise), LAYOUT)
     assert not found.alive[cell]
@@ -102,29 +101,59 @@ def test_where_lines_float_no_open_crossing_is_alive(seed, cell, leak, spread, l
     assert found.faults or "stay untested" in str(found)
 
 
+def leaking(ohms: float, seed: int) -> tuple[ShortedLine, ...]:
+    """Return lines that leak to ground, differently by up to a factor of ten."""
+    rng = np.random.default_rng(seed)
+    lines = [line for line in LAYOUT.lines if line.kind in ("row", "column")]
+    return tuple(ShortedLine(line, "ground", ohms * 10 ** rng.uniform(0, 1)) for line in lines)
+
+
 @given(
     st.integers(0, 10**6),
     st.sets(cells, max_size=4),
     st.sampled_from([None, 0, 2]),
-    st.sampled_from([1e12, 1e8, 2e7]),
+    st.sets(cells, max_size=1),
+    LEAKS,
     CONDUCTION,
 )
-def test_where_lines_float_none_of_several_is_alive(seed, opens, before, leak, spread):
+def test_where_lines_float_none_of_several_is_alive(seed, opens, before, short, leak, spread):
+    opens = opens - short
     faults = [StuckCell(cell, np.inf) for cell in opens]
+    faults += [StuckCell(cell, 0.0) for cell in short]
     if before is not None:
         faults.append(CutLine(Line(0, "row", 3), before))
         opens = opens | set(LAYOUT.cells_on(Line(0, "row", 3))[before:].tolist())
-    circuit = Circuit(LAYOUT, "floating", tuple(faults), leak_ohms=leak)
+    circuit = Circuit(LAYOUT, "floating", (*faults, *leaking(leak, seed)))
     found = judge_scan(scan_circuit(circuit, idle_of(spread, seed), seed=seed), LAYOUT)
     assert not found.alive[list(opens)].any()
+    assert blamed(found) <= opens | short
 
 
-@given(st.integers(0, 10**6), loads)
-def test_crossings_that_conduct_differently_show_that_lines_are_held(seed, load):
-    layout = SensorLayout(1, 16, 16)
-    idle = np.random.default_rng(seed).uniform(0, 0.02, layout.n_cells)
-    scan = scan_circuit(Circuit(layout, load_ohms=load, leak_ohms=1e7), idle, seed=seed)
-    assert judge_scan(scan, layout).alive.all()
+@given(st.integers(0, 10**6), loads, cells)
+def test_an_open_crossing_shows_that_lines_are_held_and_the_others_conduct(seed, load, cell):
+    idle = np.random.default_rng(seed).uniform(0, 0.02, LAYOUT.n_cells)
+    circuit = Circuit(LAYOUT, faults=(StuckCell(cell, np.inf),), load_ohms=load, leak_ohms=1e7)
+    found = judge_scan(scan_circuit(circuit, idle, seed=seed), LAYOUT)
+    assert blamed(found) == {cell}
+    assert np.flatnonzero(~found.alive).tolist() == [cell]
+
+
+@given(st.integers(0, 10**6), st.integers(0, 3), st.sampled_from(["row", "column"]), loads)
+def test_an_open_crossing_beside_a_shorted_one_and_a_cut_line_is_not_alive(
+    seed, before, kind, load
+):
+    cut = Line(0, kind, 0)
+    beyond = [LAYOUT.position(cell)[1:] for cell in LAYOUT.cells_on(cut)[before:].tolist()]
+    (row, col), (other_row, other_col) = beyond[-1], beyond[-2]
+    short = (row, 4) if kind == "column" else (4, col)
+    open_ = (other_row, 4) if kind == "column" else (4, other_col)
+    cell = LAYOUT.cell(0, *open_)
+    faults = (CutLine(cut, before), StuckCell(LAYOUT.cell(0, *short), 0.0))
+    scan = scan_of(*faults, StuckCell(cell, np.inf), seed=seed, load_ohms=load)
+    for stated in (True, None):
+        found = judge_scan(replace(scan, holds_lines=stated), LAYOUT)
+        assert not found.alive[cell]
+        assert not stated or (~found.alive).sum() <= len(beyond) * 2 + 1
 
 
 def test_where_crossings_conduct_alike_the_scan_has_to_state_that_lines_are_held():
@@ -280,5 +309,7 @@ def test_a_scan_of_another_array_or_of_no_levels_is_refused_in_one_line():
         Scan(np.array([0.0, 3.0]), np.zeros((2, 4)))
     with pytest.raises(ValueError, match=r"levels \[n\] and readings \[n, D\]; got \[2\] and \[3"):
         Scan(np.zeros(2), np.zeros((3, 4)))
+    with pytest.raises(TypeError, match=r"expected Scan\(levels \[n\], readings .* got ndarray"):
+        judge_scan(scan.readings, LAYOUT)
     with pytest.raises(ValueError, match="no frames"):
         Scan.of([])

@@ -19,7 +19,9 @@ from adaptfault.data.windows import make_windows
 from adaptfault.prediction import predictor as module
 from adaptfault.prediction.inference import Inference
 from adaptfault.prediction.predictor import Predictor, Reading
-from diagnostics import Fault, FaultSet, Monitor, SelfDiagnosis, inject
+from diagnostics import Fault, FaultSet, Monitor, Scan, SelfDiagnosis, inject
+from diagnostics.simulation.circuit import Circuit, StuckCell
+from diagnostics.simulation.scan import scan_circuit
 
 D = SMALL.n_cells
 
@@ -439,3 +441,28 @@ def test_a_predictor_accumulates_over_a_contact_only_where_it_is_asked_to(carrie
         assert one.label == other.label
     accumulating.reset()
     assert accumulating.stream(np.zeros(D)).contact is None
+
+
+def scan_of(*faults: StuckCell) -> Scan:
+    """Return a scan of the untouched array, with lines held."""
+    scan = scan_circuit(Circuit(SMALL, faults=faults), np.full(D, 0.01))
+    return Scan(scan.levels, scan.readings, holds_lines=True)
+
+
+def test_a_scan_is_evidence_of_its_monitor_each_crossing_where_its_cell_answers(
+    carried, monkeypatch
+):
+    scan = scan_of(StuckCell(8, np.inf))
+    predictor = running(carried)
+    (fault,) = predictor.scan(scan)
+    assert fault.cells == (8,)
+    assert predictor.faults == (fault,)
+    assert predictor.stream(presses(50, 1)[0]).faults == (fault,)
+    with pytest.raises(ValueError, match=f"a scan of 4 cells, but the array has {D}"):
+        predictor.scan(Scan(np.array([0.0, 1.0]), np.zeros((2, 4))))
+    assert predictor.faults == (fault,)
+    exchanged = np.arange(D)
+    exchanged[[7, 8]] = (8, 7)
+    monkeypatch.setattr(Version, "source", exchanged)
+    (fault,) = running(carried).scan(scan)
+    assert fault.cells == (7,)

@@ -70,6 +70,14 @@ def test_masks_leave_half_of_a_batch_whole():
 
 
 def test_the_table_has_wilsons_intervals():
-    row = mujoco_policy.Row("none", "fill", 0.0, ("lifted",) * 45 + ("dropped",) * 5)
-    assert row.interval == pytest.approx((0.7864, 0.9565), abs=1e-4)
-    assert "0.90 (0.79 to 0.96)" in mujoco_policy.table([row])
+    row = mujoco_policy.Row(0, "none", "fill", 0.0, ("lifted",) * 45 + ("dropped",) * 5)
+    assert mujoco_policy.success([row]) == pytest.approx((0.9, 0.7864, 0.9565), abs=1e-4)
+    assert "| 0.90 (0.79 to 0.96) |" in mujoco_policy.table([row])
+
+
+def test_the_table_tells_each_seed_beside_the_rate_over_all():
+    rows = [
+        mujoco_policy.Row(seed, "none", "fill", 0.0, ("lifted",) * n + ("dropped",) * (50 - n))
+        for seed, n in enumerate((45, 35))
+    ]
+    assert "| 0.80 (0.71 to 0.87): 0.90, 0.70 |" in mujoco_policy.table(rows)

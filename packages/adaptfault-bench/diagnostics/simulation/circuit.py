@@ -66,10 +66,14 @@ class CutLine:
 
 @dataclass(frozen=True)
 class ShortedLine:
-    """A row or column touches the supply or ground, at its driven end."""
+    """A row or column touches the supply or ground, at its driven end.
+
+    ``ohms`` is the resistance between the two, as of dirt; None: ``short_ohms``, two conductors.
+    """
 
     line: Line
     to: Literal["supply", "ground"]
+    ohms: float | None = None
 
 
 @dataclass(frozen=True)
@@ -326,7 +330,6 @@ class _Pad:
     def build(cls, circuit: Circuit, pad: int) -> _Pad:
         """Return the wires of a pad with the faults of the circuit in them."""
         layout = circuit.layout
-        short = 1 / circuit.short_ohms
         rows = layout.rows
         cols = layout.cols
         row_wire, column_wire = (w.copy() for w in np.indices((rows, cols)))
@@ -359,9 +362,10 @@ class _Pad:
                         row_wire[line.index] if line.kind == "row" else column_wire[:, line.index]
                     )
                     of_line[part] = number
-                case ShortedLine(to=to):
-                    static[wire, wire] += short
-                    source[wire] += short if to == "supply" else 0.0
+                case ShortedLine(to=to, ohms=ohms):
+                    joined = 1 / (ohms or circuit.short_ohms)
+                    static[wire, wire] += joined
+                    source[wire] += joined if to == "supply" else 0.0
                 case BridgedLines(ohms=ohms):
                     pair = np.array([wire, wire + 1])
                     joined = 1 / (ohms or circuit.short_ohms)
@@ -412,7 +416,7 @@ def _check(fault: NetlistFault, layout: SensorLayout) -> None:
             layout.rows if line.kind == "row" else layout.cols
         ):
             raise ValueError(f"{fault}: {line} is the last of its kind; name the one before it")
-        case BridgedLines(_, float(ohms)) if not ohms > 0:
+        case BridgedLines(_, float(ohms)) | ShortedLine(ohms=float(ohms)) if not ohms > 0:
             raise ValueError(f"{fault}: ohms must be positive; None for short_ohms")
         case StuckBit(_, level) if level not in (0, 1):
             raise ValueError(f"{fault}: a bit sticks at level 0 or 1")

@@ -15,7 +15,7 @@ from adaptfault.acquisition.ordering import Frame
 from adaptfault.acquisition.recorder import Recorded, Recorder
 from adaptfault.acquisition.scanning import Scans
 from adaptfault.acquisition.switch import Contact, Rule, Switch
-from diagnostics import Diagnosis, Fault, FaultSet, Monitor, ReadOut, SensorLayout
+from diagnostics import Diagnosis, Fault, FaultSet, Monitor, ReadOut, Scan, SensorLayout
 
 CONFIRMED_AFTER = 100
 """Number of predicted windows after which a version on probation is confirmed."""
@@ -50,6 +50,9 @@ class StreamingPredictor(Protocol):
     @property
     def evaluated(self) -> Diagnosis | None: ...  # noqa: D102
     def stream(self, frame: NDArray[np.float64], time: float | None = None) -> StreamResult: ...  # noqa: D102
+    def scan(self, scan: Scan) -> tuple[Fault, ...]: ...  # noqa: D102
+    @property
+    def faults(self) -> tuple[Fault, ...]: ...  # noqa: D102
     def confirm(self) -> bool | None: ...  # noqa: D102
     def sibling(self) -> StreamingPredictor: ...  # noqa: D102
 
@@ -213,12 +216,13 @@ class Session:
 
     def _scanned(self, scans: Scans, found: ReadOut | None) -> list[Event]:
         """Return what a scan says that has ended; None: none has."""
-        if found is None:
+        if found is None or scans.last is None:
             return []
-        told = found.faults
+        news = self.watcher.scan(scans.last)
+        self.faults = self.watcher.faults
         tested = int((found.alive | found.broken).sum())
         data = {
-            "faults": [fault.to_dict() for fault in told],
+            "faults": [fault.to_dict() for fault in found.faults],
             "tested": tested,
             "under_load": found.under_load,
             "incomplete": found.incomplete,
@@ -226,11 +230,10 @@ class Session:
         events = [self._event("scan", found.summary, **data)]
         if self._faulty is None:
             self._faulty = np.zeros(found.alive.size, bool)
-        for fault in told:
-            if not self._faulty[list(fault.cells)].all():
-                events.append(self._fault_event(fault))
+        for fault in news:
+            events.append(self._fault_event(fault))
             self._faulty[list(fault.cells)] = True
-        if self.recorder is not None and scans.last is not None:
+        if self.recorder is not None:
             try:
                 path = self.recorder.write_scan(scans.last)
             except OSError as error:

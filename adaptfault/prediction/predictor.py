@@ -16,9 +16,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from adaptfault.bundle.bundle import PROCESS
 from adaptfault.bundle.checksummed_json import Damaged, decoding
 from adaptfault.bundle.pointer import file_stamp
+from adaptfault.bundle.running import PROCESS
 from adaptfault.data.windows import finite_windows, scale
 from adaptfault.inspection.converter_range import within_range
 from adaptfault.models.accumulation import ContactDecision

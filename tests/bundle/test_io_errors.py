@@ -19,9 +19,8 @@ import pytest
 import adaptfault as af
 from adaptfault.acquisition import Session
 from adaptfault.acquisition.ordering import Frame
-from adaptfault.bundle import bundle as bundle_module
 from adaptfault.bundle import journal as journal_module
-from adaptfault.bundle import lock
+from adaptfault.bundle import lock, running
 from adaptfault.bundle.checksummed_json import Damaged, reading
 from adaptfault.bundle.journal import Entry
 from adaptfault.bundle.lock import Busy, locked
@@ -178,7 +177,7 @@ def test_who_waits_for_a_lock_waits_for_two_seconds_at_most(monkeypatch, tmp_pat
 def test_a_confirmation_while_another_program_holds_the_journal_counts_and_its_entry_waits(
     carried, monkeypatch
 ):
-    monkeypatch.setattr(bundle_module, "_IN_LOOP", 0.0)
+    monkeypatch.setattr(running, "_IN_LOOP", 0.0)
     deploy(carried, 3)
     bundle = af.Bundle.open(carried)
     # so that there is a journal

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from tqdm import tqdm
 
-from adaptfault.bundle.bundle import now
+from adaptfault.bundle.journal import now
 from adaptfault.bundle.lock import locked
 from adaptfault.data.documents import rebuilt
 from adaptfault.data.json_lines import Lines

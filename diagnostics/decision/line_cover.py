@@ -176,24 +176,21 @@ def _explain(
         singles, before = int((~behind[found]).sum()), singles
         if singles == before:
             break
-    causes: list[Cause] = []
-    explained = np.zeros(layout.n_cells, bool)
 
-    def cause(c: _Candidate, gain: float, proven: bool) -> Cause:
+    def cause(c: _Candidate, faulty: NDArray[np.bool_], proven: bool) -> Cause:
         cells = c.cells[~contradicting[c.cells]]
         seen = cells[supporting[cells]]
-        return Cause(
-            c.line, tuple(cells.tolist()), tuple(seen.tolist()), float(expit(gain)), c.whole, proven
-        )
+        broken = float(expit(_gain(c, faulty, support, cell_cost)))
+        return Cause(c.line, tuple(cells.tolist()), tuple(seen.tolist()), broken, c.whole, proven)
 
-    for c in chosen_wires:
-        causes.append(cause(c, _gain(c, faulty, support, cell_cost), True))
-        explained[list(causes[-1].cells)] = True
-    causes += [Cause(None, (cell,), (cell,), 1.0) for cell in found.tolist() if not explained[cell]]
+    causes = [cause(c, faulty, True) for c in chosen_wires]
+    explained = np.zeros(layout.n_cells, bool)
+    explained[[cell for one in causes for cell in one.cells]] = True
     left = faulty & ~explained
+    causes += [Cause(None, (cell,), (cell,), 1.0) for cell in np.flatnonzero(left).tolist()]
     support = np.where(explained, 0.0, support)
     more = _cheapest(candidates, np.flatnonzero(left), left, support, cell_cost, 0.0)
-    return causes + [cause(c, _gain(c, left, support, cell_cost), False) for c in more]
+    return causes + [cause(c, left, False) for c in more]
 
 
 def _candidates(

@@ -370,40 +370,34 @@ class Diagnosis:
             )
         except (KeyError, TypeError, AttributeError, OverflowError) as error:
             raise ValueError(f"the diagnosis is damaged: {type(error).__name__} {error}") from None
-        size = (diagnosis.layout.n_cells,)
-        vectors = {
-            "probability": diagnosis.probability,
-            "verdicts": diagnosis.tested,
-            **diagnosis.evidence,
-        }
-        for name, vector in vectors.items():
-            if vector.shape != size:
-                raise ValueError(
-                    f"the diagnosis is damaged: {name} has shape {list(vector.shape)}, expected"
-                    f" {list(size)}"
-                )
-        if not ((diagnosis.probability >= 0) & (diagnosis.probability <= 1)).all():
-            raise ValueError("the diagnosis is damaged: a probability is not between 0 and 1")
-        if not all(
-            isinstance(n, int) and n >= 0 for n in (diagnosis.n_frames, diagnosis.n_recordings)
-        ):
-            raise ValueError(
-                "the diagnosis is damaged: n_frames and n_recordings must be whole numbers >= 0"
-            )
-        if not all(
-            isinstance(t.reason, str) and isinstance(t.kind, str) for t in diagnosis.transport
-        ):
-            raise ValueError(
-                "the diagnosis is damaged: a transport fault needs a kind and a reason"
-            )
-        if not all(np.isfinite(values).all() for values in diagnosis.evidence.values()):
-            raise ValueError("the diagnosis is damaged: evidence must be finite")
-        # raise ValueError for cells of another layout
-        _ = (
-            diagnosis.statically_loaded,
-            diagnosis.fault_set,
-        )
+        diagnosis._check()
         return diagnosis
+
+    def _check(self) -> None:
+        """Raise ValueError where a stored diagnosis does not fit together."""
+        size = (self.layout.n_cells,)
+        vectors = {"probability": self.probability, "verdicts": self.tested, **self.evidence}
+        wrong = [
+            f"{name} has shape {list(vector.shape)}, expected {list(size)}"
+            for name, vector in vectors.items()
+            if vector.shape != size
+        ]
+        fits = {
+            "a probability is not between 0 and 1": (
+                (self.probability >= 0) & (self.probability <= 1)
+            ).all(),
+            "n_frames and n_recordings must be whole numbers >= 0": all(
+                isinstance(n, int) and n >= 0 for n in (self.n_frames, self.n_recordings)
+            ),
+            "a transport fault needs a kind and a reason": all(
+                isinstance(t.reason, str) and isinstance(t.kind, str) for t in self.transport
+            ),
+            "evidence must be finite": all(np.isfinite(of).all() for of in self.evidence.values()),
+        }
+        wrong += [what for what, is_right in fits.items() if not is_right]
+        if wrong:
+            raise ValueError(f"the diagnosis is damaged: {wrong[0]}")
+        _ = self.statically_loaded, self.fault_set  # raise ValueError for cells of another layout
 
 
 def _recordings_of(about: Mapping[str, Any] | None, n_cells: int) -> dict[str, Any]:

@@ -21,8 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from diagnostics.decision.calibration import calibrated, faulty_at, probability_of
+from diagnostics.decision.cell_findings import CellFindings
 from diagnostics.decision.judged import Judged
-from diagnostics.decision.root_causes import CellFindings
 from diagnostics.events.contact_events import EventLog
 from diagnostics.events.tiled_events import TiledEvents
 from diagnostics.events.tiles import Rectangle, tiles

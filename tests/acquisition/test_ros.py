@@ -311,7 +311,7 @@ def test_frames_that_wait_to_be_monitored_are_counted_where_too_many_wait(log):
     assert watch.work() == ()
     for frame in np.resize(log, (WAITING + 2, 220)):
         watch.put(frame)
-    assert watch.left_out == 2
+    assert watch.queue.left_out == 2
 
 
 def test_frames_are_restored_and_no_status_is_stale_while_the_monitor_is_busy(

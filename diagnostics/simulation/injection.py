@@ -18,14 +18,19 @@ from diagnostics.layout import SensorLayout
 from diagnostics.preprocessing.levels import LIGHT
 from diagnostics.wiring import Line
 
-# Defaults of ``Fault.value`` and thresholds, as shares of full scale.
-_NOISE = 0.05  # NOISY: standard deviation of the added noise
-_DRIFT = 0.01  # DRIFT: offset gained per second
-_SWING = 0.2  # FLOATING: range of the movement
-_CLAMP = 0.1  # CLAMPED: highest reading
+# Defaults of ``Fault.value``, as shares of full scale, and as they are.
+_SHARES = {
+    FaultKind.SHORT: 1.0,
+    FaultKind.NOISY: 0.05,  # standard deviation of the added noise
+    FaultKind.DRIFT: 0.01,  # offset gained per second
+    FaultKind.FLOATING: 0.2,  # range of the movement
+    FaultKind.CLAMPED: 0.1,  # highest reading
+}
+_NUMBERS = {
+    FaultKind.LATE: 10,  # frames
+    FaultKind.WEAK: 0.35,  # share of the load that is left
+}
 _PERIODS = (12.0, 100.0)  # FLOATING: frames of one swing, drawn between these
-_DELAY = 10  # LATE: frames
-_WEAK = 0.35  # WEAK: share of the load that is left
 # INTERMITTENT: probability per frame that a closed contact opens, and that an open one closes.
 _OPENS = 0.2
 _CLOSES = 0.4
@@ -101,13 +106,13 @@ def _faulty_readings(
     """Return what ``cells`` read under ``fault``, ``[t, len(cells)]``."""
     own = healthy[:, cells]
     full_scale = layout.full_scale
+    value = fault.value
+    if value is None:
+        value = _SHARES.get(fault.kind, 0.0) * full_scale + _NUMBERS.get(fault.kind, 0.0)
     match fault.kind:
         case FaultKind.OPEN | FaultKind.SHORT | FaultKind.STUCK:
-            value = fault.value
-            if value is None:
-                if fault.kind is FaultKind.STUCK:
-                    raise ValueError("a STUCK fault needs a value: what do its cells read?")
-                value = full_scale if fault.kind is FaultKind.SHORT else 0.0
+            if fault.kind is FaultKind.STUCK and fault.value is None:
+                raise ValueError("a STUCK fault needs a value: what do its cells read?")
             return value + dither * full_scale * rng.uniform(-1.0, 1.0, own.shape)
         case FaultKind.ALIAS:
             partners = _bridge_partners(fault, cells, layout)
@@ -122,34 +127,28 @@ def _faulty_readings(
             # One contact serves all the cells of the fault: they blink together, each only while it
             # is loaded.
             closed = _blinking(len(own), rng)[:, None]
-            return np.where(closed | ~(own > LIGHT * full_scale), own, fault.value or 0.0)
+            return np.where(closed | ~(own > LIGHT * full_scale), own, value)
         case FaultKind.NOISY:
-            sigma = _NOISE * full_scale if fault.value is None else fault.value
-            return own + rng.normal(0.0, sigma, own.shape)
+            return own + rng.normal(0.0, value, own.shape)
         case FaultKind.DRIFT:
-            rate = _DRIFT * full_scale if fault.value is None else fault.value
             frames = np.arange(1, len(own) + 1)[:, None]
             drifted: NDArray[np.float64] = (
-                own * (1.0 + gain / layout.rate * frames) + rate / layout.rate * frames
+                own * (1.0 + gain / layout.rate * frames) + value / layout.rate * frames
             )
             return drifted
         case FaultKind.FLOATING:
-            swing = _SWING * full_scale if fault.value is None else fault.value
-            floating: NDArray[np.float64] = np.fmin.reduce(own, initial=np.inf) + swing * _swinging(
-                own.shape, rng
-            )
+            swing = value * _swinging(own.shape, rng)
+            floating: NDArray[np.float64] = np.fmin.reduce(own, initial=np.inf) + swing
             return floating
         case FaultKind.LATE:
-            delay = _DELAY if fault.value is None else int(fault.value)
-            return own[np.maximum(np.arange(len(own)) - delay, 0)]
+            return own[np.maximum(np.arange(len(own)) - int(value), 0)]
         case FaultKind.COPY:
             return _copied(fault, cells, healthy, layout)
         case FaultKind.CLAMPED:
-            return np.minimum(own, _CLAMP * full_scale if fault.value is None else fault.value)
+            return np.minimum(own, value)
         case FaultKind.WEAK:
-            share = _WEAK if fault.value is None else fault.value
             lowest = np.fmin.reduce(own, initial=np.inf)
-            weakened: NDArray[np.float64] = lowest + share * (own - lowest)
+            weakened: NDArray[np.float64] = lowest + value * (own - lowest)
             return weakened
 
 

@@ -144,23 +144,14 @@ class Summary:
 
     def plot(self) -> Figure:
         """Draw the mean and the peak of each cell, one map a pad; a cross marks a silent cell."""
-        from diagnostics.decision.plot import draw_forces, pads_figure
+        from diagnostics.decision.plot import draw_row, pads_figure
 
         layout = self.layout
         figure, axes = pads_figure(layout, n_rows=2)
-        size = layout.rows * layout.shape[2]
-        for (name, values), row in zip(
-            {"mean": self.mean, "peak": self.highest}.items(), axes, strict=True
-        ):
-            shown = np.where(layout.present.ravel(), values, np.nan)
-            top = _most(shown) or layout.full_scale
-            for pad, ax in enumerate(row):
-                silent = [int(c) - pad * size for c in self.silent if c // size == pad]
-                image = draw_forces(
-                    ax, layout.grid(shown)[pad], layout, silent, vmin=0, vmax=top, cmap="viridis"
-                )
-                ax.set_title(f"{name}, pad {pad}", fontsize=9)
-            figure.colorbar(image, ax=row.tolist(), label=layout.unit)
+        maps = {"mean, ": self.mean, "peak, ": self.highest}
+        for (title, values), row in zip(maps.items(), axes, strict=True):
+            top = _most(values[layout.present.ravel()]) or layout.full_scale
+            draw_row(row, values, layout, title, self.silent, top=top, label=layout.unit)
         if self.silent.size:
             figure.supxlabel("x: the reading of the cell never changes", fontsize=8)
         return figure

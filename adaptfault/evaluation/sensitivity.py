@@ -135,19 +135,16 @@ class Sensitivity:
 
     def plot(self) -> Any:
         """Draw the accuracy lost on a map of each pad and value; return the matplotlib figure."""
-        from diagnostics.decision.plot import draw_forces, pads_figure
+        from diagnostics.decision.plot import draw_row, pads_figure
 
         figure, axes = pads_figure(self.layout, n_rows=len(self.values))
         shown = np.where(self.layout.present.ravel(), self.accuracy_lost, np.nan)
         for value, losses, row in zip(self.values, shown, axes, strict=True):
             # each value on its own scale: a short costs far more
             top = max(float(np.nanmax(losses)), 1 / self.n)
-            for pad, ax in enumerate(row):
-                image = draw_forces(
-                    ax, self.layout.grid(losses)[pad], self.layout, vmin=0, vmax=top, cmap="Reds"
-                )
-                ax.set_title(f"stuck at {value:g}, pad {pad}", fontsize=9)
-            figure.colorbar(image, ax=row.tolist(), label="accuracy lost")
+            title = f"stuck at {value:g}, "
+            label = "accuracy lost"
+            draw_row(row, losses, self.layout, title, top=top, cmap="Reds", label=label)
         for rank, (cell, value, lost) in enumerate(self.worst(), start=1):
             pad, at, col = self.layout.position(cell)
             if lost > 0:

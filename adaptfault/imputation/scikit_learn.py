@@ -100,9 +100,7 @@ class CellImputer(OneToOneFeatureMixin, TransformerMixin, BaseEstimator):  # typ
         if key not in self._maps:
             if len(self._maps) >= 64:
                 self._maps.clear()
-            self._maps[key] = self._model.affine(
-                FaultSet(tuple(np.flatnonzero(mask).tolist()), len(mask))
-            )
+            self._maps[key] = self._model.affine(FaultSet.of(mask, len(mask)))
         return self._maps[key]
 
     def __sklearn_tags__(self) -> Any:

@@ -64,7 +64,8 @@ def inspect(
     disturbances = _disturbances(given, log, healthy, layout)
     if any(one.name == "silent_array" for one in disturbances):
         findings = [_finding(one) for one in disturbances]
-        return Inspection(ChangedReadings(None, None, log, _untold(log, layout)), tuple(findings))
+        untold = Diagnosis.untold(layout, list(map(len, log)))
+        return Inspection(ChangedReadings(None, None, log, untold), tuple(findings))
     crosstalk = shared.crosstalk is not None
     if diagnoser.reference_ is None:
         fitted = diagnoser.for_log(log, classes=classes, progress=progress)
@@ -228,15 +229,3 @@ def _of_change(change: SensorChange | None) -> list[Finding]:
 
 def _finding(disturbance: Disturbance) -> Finding:
     return finding_of(disturbance.name, disturbance.reason)
-
-
-def _untold(log: list[NDArray[np.float64]], layout: SensorLayout) -> Diagnosis:
-    """Return a diagnosis that judges no cell."""
-    return Diagnosis(
-        layout=layout,
-        faults=(),
-        probability=np.zeros(layout.n_cells),
-        tested=np.zeros(layout.n_cells, bool),
-        n_frames=sum(map(len, log)),
-        n_recordings=len(log),
-    )

@@ -105,15 +105,7 @@ def quick(statistics: Statistics) -> Quick:
     if load is not None:
         held = replace(held, value=load.readings(held.value, np.zeros(len(place), bool)))
     held = held.of(place)
-    diagnosis = Diagnosis(
-        layout=layout,
-        faults=(),
-        probability=np.zeros(layout.n_cells),
-        tested=np.zeros(layout.n_cells, bool),
-        n_frames=sum(lengths),
-        n_recordings=len(lengths),
-        transport=_transport(statistics),
-    )
+    diagnosis = Diagnosis.untold(layout, lengths, transport=_transport(statistics))
     diagnosis = with_recordings(diagnosis, held, lengths, tolerance, None)
     together = statistics.together.of_cells(order)
     present = layout.present.ravel()

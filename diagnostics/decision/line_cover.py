@@ -86,9 +86,9 @@ class _Candidate:
 
 
 def solve(
-    faulty: NDArray[np.bool_],
-    consistent: NDArray[np.bool_],
-    contradicting: NDArray[np.bool_],
+    faulty: Mask,
+    consistent: Mask,
+    contradicting: Mask,
     weight: NDArray[np.float64],
     layout: SensorLayout,
     common: float = 0.0,
@@ -134,9 +134,9 @@ def _ends(line: Line, cells: NDArray[np.intp], contradicting: Mask) -> tuple[NDA
 
 
 def _explain(
-    faulty: NDArray[np.bool_],
-    consistent: NDArray[np.bool_],
-    contradicting: NDArray[np.bool_],
+    faulty: Mask,
+    consistent: Mask,
+    contradicting: Mask,
     weight: NDArray[np.float64],
     layout: SensorLayout,
     lines: Sequence[Line],
@@ -177,7 +177,7 @@ def _explain(
         if singles == before:
             break
 
-    def cause(c: _Candidate, faulty: NDArray[np.bool_], proven: bool) -> Cause:
+    def cause(c: _Candidate, faulty: Mask, proven: bool) -> Cause:
         cells = c.cells[~contradicting[c.cells]]
         seen = cells[supporting[cells]]
         broken = float(expit(_gain(c, faulty, support, cell_cost)))
@@ -196,9 +196,9 @@ def _explain(
 def _candidates(
     line: Line,
     cells: NDArray[np.intp],
-    contradicting: NDArray[np.bool_],
-    supporting: NDArray[np.bool_],
-    faulty: NDArray[np.bool_],
+    contradicting: Mask,
+    supporting: Mask,
+    faulty: Mask,
 ) -> list[_Candidate]:
     """Return the wire broken as a whole, and in its middle with either end working, where enough
     cells support it."""
@@ -237,9 +237,7 @@ def _discount(candidates: Sequence[_Candidate], uncertain: Mask) -> NDArray[np.f
     return discount
 
 
-def _gain(
-    c: _Candidate, faulty: NDArray[np.bool_], support: NDArray[np.float64], cell_cost: float
-) -> float:
+def _gain(c: _Candidate, faulty: Mask, support: NDArray[np.float64], cell_cost: float) -> float:
     uncertain = c.cells[~faulty[c.cells]]
     return float(faulty[c.cells].sum()) * cell_cost + float(support[uncertain].sum()) - c.cost
 
@@ -247,7 +245,7 @@ def _gain(
 def _cheapest(
     candidates: Sequence[_Candidate],
     found: NDArray[np.intp],
-    faulty: NDArray[np.bool_],
+    faulty: Mask,
     support: NDArray[np.float64],
     cell_cost: float,
     least: float = PROVEN,
@@ -270,9 +268,7 @@ def _cheapest(
     return [c for c in candidates if _gain(c, faulty, support, cell_cost) > least]
 
 
-def cheapest_of_few(
-    cost: NDArray[np.float64], covers: NDArray[np.bool_], saves: NDArray[np.float64]
-) -> Mask:
+def cheapest_of_few(cost: NDArray[np.float64], covers: Mask, saves: NDArray[np.float64]) -> Mask:
     """Return the set of wires of least cost, bool ``[wires]``, by enumeration.
 
     Args:
@@ -287,9 +283,7 @@ def cheapest_of_few(
     return best
 
 
-def cheapest_of_many(
-    cost: NDArray[np.float64], covers: NDArray[np.bool_], saves: NDArray[np.float64]
-) -> Mask:
+def cheapest_of_many(cost: NDArray[np.float64], covers: Mask, saves: NDArray[np.float64]) -> Mask:
     """Return the same set by integer programming: slower for few wires, feasible for many."""
     from scipy import sparse
     from scipy.optimize import Bounds, LinearConstraint, milp

@@ -105,6 +105,39 @@ def draw_forces(
     return image
 
 
+def draw_row(
+    axes: Sequence[Axes],
+    values: ArrayLike,
+    layout: SensorLayout,
+    title: str = "",
+    dead: Iterable[int] = (),
+    *,
+    top: float,
+    cmap: str = "viridis",
+    **bar: Any,
+) -> None:
+    """Draw values ``[D]`` as a heatmap of each pad with one colour bar, a cross on each of the
+    ``dead`` cells.
+
+    Args:
+        axes: one a pad.
+        values, layout: of the array.
+        title: before the name of the pad.
+        dead: cells.
+        top: value at the end of the scale, which begins at 0.
+        cmap: of the scale.
+        bar: of the colour bar.
+    """
+    size = layout.n_cells // layout.pads
+    shown = layout.grid(np.where(layout.present.ravel(), values, np.nan))
+    marked = list(dead)
+    for pad, ax in enumerate(axes):
+        on_pad = [int(cell) % size for cell in marked if cell // size == pad]
+        image = draw_forces(ax, shown[pad], layout, on_pad, vmin=0, vmax=top, cmap=cmap)
+        ax.set_title(f"{title}pad {pad}", fontsize=9)
+    axes[0].figure.colorbar(image, ax=list(axes), **bar)
+
+
 def pads_figure(
     layout: SensorLayout, *, n_rows: int, scale: bool = True, page: float = PAGE
 ) -> tuple[Figure, Any]:

@@ -3,7 +3,7 @@ coverage."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from enum import IntEnum
 from functools import cached_property
@@ -115,12 +115,17 @@ class Diagnosis:
     states: NDArray[np.uint8] | None = None
     names: tuple[str, ...] = ()
 
+    @classmethod
+    def untold(cls, layout: SensorLayout, lengths: Sequence[int], **told: Any) -> Diagnosis:
+        """Return a diagnosis that judges no cell, of recordings of so many frames; ``told``: other
+        attributes."""
+        nothing = np.zeros(layout.n_cells)
+        return cls(layout, (), nothing, nothing > 0, sum(lengths), len(lengths), **told)
+
     @cached_property
     def fault_set(self) -> FaultSet:
         """F: the cells of all faults; an adapter must not use their readings."""
-        return FaultSet(
-            tuple({c for fault in self.faults for c in fault.cells}), self.layout.n_cells
-        )
+        return FaultSet.of([c for f in self.faults for c in f.cells], self.layout.n_cells)
 
     @cached_property
     def false_share(self) -> float:
@@ -152,18 +157,14 @@ class Diagnosis:
     def statically_loaded(self) -> FaultSet:
         """The cells of all static loads: healthy as far as the log tells, but their readings are
         not of contact."""
-        return FaultSet(
-            tuple({c for load in self.static_loads for c in load.cells}), self.layout.n_cells
-        )
+        return FaultSet.of([c for f in self.static_loads for c in f.cells], self.layout.n_cells)
 
     @property
     def disturbed(self) -> FaultSet:
         """The statically loaded cells and those beside them, which the edge of an object may
         load."""
-        beside = self.layout.beside[list(self.statically_loaded)].ravel()
-        return self.statically_loaded | FaultSet(
-            tuple(beside[beside >= 0].tolist()), self.layout.n_cells
-        )
+        loaded = self.statically_loaded
+        return FaultSet.of(self.layout.with_neighbours(loaded.mask), self.layout.n_cells)
 
     @property
     def n_lost(self) -> int:
@@ -179,10 +180,8 @@ class Diagnosis:
         both. On real grasps the two costs are equal at a probability of 0.02 for cells that read 0,
         and at 0.001 for full scale.
         """
-        likely = np.flatnonzero(
-            self.tested & (self.probability >= probability) & self.layout.present.ravel()
-        )
-        return self.fault_set | FaultSet(tuple(likely.tolist()), self.layout.n_cells)
+        likely = self.tested & (self.probability >= probability) & self.layout.present.ravel()
+        return FaultSet.of(likely | self.fault_set.mask, self.layout.n_cells)
 
     @cached_property
     def verdicts(self) -> NDArray[np.object_]:

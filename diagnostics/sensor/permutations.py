@@ -64,7 +64,7 @@ def candidates_of(layout: SensorLayout, surplus: Floats, source: Cells) -> Itera
         )
 
 
-def _orientations(rows: int, columns: int) -> Iterator[tuple[NDArray[np.intp], str]]:
+def _orientations(rows: int, columns: int) -> Iterator[tuple[Cells, str]]:
     """Yield the orders of a pad that is turned or read in the other order, ``[rows, columns]``, and
     their names."""
     if min(rows, columns) < 2:
@@ -77,7 +77,7 @@ def _orientations(rows: int, columns: int) -> Iterator[tuple[NDArray[np.intp], s
     yield np.arange(rows * columns)[::-1].reshape(rows, columns), "turned by half a turn"
 
 
-def _exchanged(size: int, a: int, b: int) -> NDArray[np.intp]:
+def _exchanged(size: int, a: int, b: int) -> Cells:
     """Return the order of ``size`` lines or pads with two of them exchanged."""
     order = np.arange(size)
     order[[a, b]] = b, a

@@ -148,7 +148,7 @@ class Session:
     def fault_set(self) -> FaultSet:
         """The cells that the monitor finds faulty now."""
         assert self._faulty is not None  # after the first frame
-        return FaultSet(tuple(np.flatnonzero(self._faulty).tolist()), self._faulty.size)
+        return FaultSet.of(self._faulty, self._faulty.size)
 
     def take(self, frame: Frame, now: float) -> list[Event]:
         """Process a frame that arrived at ``now`` (seconds of the receiver's clock); return its

@@ -215,8 +215,7 @@ class Watch:
         found = self._scans.ended(now)
         if found is not None:
             self.read_out = found
-            cells = tuple(np.flatnonzero(found.broken).tolist())
-            self.remember(FaultSet(cells, found.broken.size))
+            self.remember(FaultSet.of(found.broken, found.broken.size))
 
     def work(self) -> tuple[Fault, ...]:
         """Monitor the frame that waits longest, if one waits; return the faults that are new,
@@ -293,7 +292,7 @@ class Watch:
         return (len(times) - 1) / max(times[-1] - times[0], 1e-9)
 
     def _found(self) -> FaultSet:
-        return FaultSet(tuple(np.flatnonzero(self.faulty).tolist()), self.faulty.size)
+        return FaultSet.of(self.faulty, self.faulty.size)
 
     @staticmethod
     def _repair_of(sensor: Sensor) -> FrameRepair | None:

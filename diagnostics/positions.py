@@ -31,6 +31,11 @@ class Positions:
         """D, the number of positions times axes: ``pads * rows * cols * axes``."""
         return self.pads * self.rows * self.cols * self.axes
 
+    @property
+    def is_cell(self) -> NDArray[np.bool_]:
+        """Whether there is a cell at each position, bool ``[D]``."""
+        return self.present.ravel()
+
     def cell(self, pad: int, row: int, col: int, axis: int = 0) -> int:
         """Return the index of the cell at a position; IndexError names what is out of range."""
         sizes = self.pads, self.rows, self.cols, self.axes

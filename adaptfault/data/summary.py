@@ -71,11 +71,11 @@ class Summary:
         """Present cells whose reading never changes: not loaded, or faulty."""
         with np.errstate(invalid="ignore"):
             constant = ~(self.highest > self.lowest)
-        return np.flatnonzero(constant & self.layout.present.ravel())
+        return np.flatnonzero(constant & self.layout.is_cell)
 
     def to_dict(self) -> dict[str, Any]:
         """Return a JSON-safe dict of the schema "adaptfault.info/1"."""
-        present = self.layout.present.ravel()
+        present = self.layout.is_cell
         return {
             "schema": SCHEMA,
             **members(self, "layout", "step", "silent", "classes", "inferred"),
@@ -90,7 +90,7 @@ class Summary:
         }
 
     def __str__(self) -> str:
-        layout, present = self.layout, self.layout.present.ravel()
+        layout, present = self.layout, self.layout.is_cell
         least = int(self.lengths.min())
         most = int(self.lengths.max())
         missing = int(self.missing[present].sum())
@@ -113,7 +113,7 @@ class Summary:
         return "\n".join([*lines, *(f"{'inferred':12s} {text}" for text in self.inferred)])
 
     def _readings(self) -> str:
-        present = self.layout.present.ravel()
+        present = self.layout.is_cell
         low = _least(self.lowest[present])
         high = _most(self.highest[present])
         if low is None or high is None:
@@ -150,7 +150,7 @@ class Summary:
         figure, axes = pads_figure(layout, n_rows=2)
         maps = {"mean, ": self.mean, "peak, ": self.highest}
         for (title, values), row in zip(maps.items(), axes, strict=True):
-            top = _most(values[layout.present.ravel()]) or layout.full_scale
+            top = _most(values[layout.is_cell]) or layout.full_scale
             draw_row(row, values, layout, title, self.silent, top=top, label=layout.unit)
         if self.silent.size:
             figure.supxlabel("x: the reading of the cell never changes", fontsize=8)
@@ -206,7 +206,7 @@ def summarise(
         lowest=np.where(seen, lowest, np.nan),
         highest=np.where(seen, highest, np.nan),
         rest=_rest(np.concatenate(sample)),
-        step=_step(np.concatenate(sample)[:, layout.present.ravel()]),
+        step=_step(np.concatenate(sample)[:, layout.is_cell]),
         missing=np.int64(sum(seen_frames)) - finite,
         classes=dict(classes or {}),
         inferred=inferred,

@@ -78,7 +78,7 @@ def _draw_maps(result: DemoResult, page: float) -> Figure:
     layout = result.recordings.layout
     figure, axes = pads_figure(layout, n_rows=len(result.maps), page=page)
     # One colour scale for all, from the healthy map: a short is then off the scale.
-    top = float(np.nanmax(result.maps["normal"][layout.present.ravel()])) or layout.full_scale
+    top = float(np.nanmax(result.maps["normal"][layout.is_cell])) or layout.full_scale
     marks = {"normal": FaultSet((), layout.n_cells), "broken": result.injected_set}
     for (name, values), row in zip(result.maps.items(), axes, strict=True):
         dead = marks.get(name, result.diagnosis.fault_set)

@@ -101,7 +101,7 @@ class Sensitivity:
         cells, ``[V]``."""
         from scipy.stats import spearmanr
 
-        present = self.layout.present.ravel()
+        present = self.layout.is_cell
         pairs = zip(self.gradient[:, present], self.confidence_lost[:, present], strict=True)
         return np.array(
             [spearmanr(a, b).statistic if np.ptp(a) and np.ptp(b) else np.nan for a, b in pairs]
@@ -124,7 +124,7 @@ class Sensitivity:
         for value, lost, rho in zip(
             self.values, self.accuracy_lost, self.rank_correlation, strict=True
         ):
-            present = lost[self.layout.present.ravel()]
+            present = lost[self.layout.is_cell]
             lines.append(
                 f"one cell at {value:g}: accuracy {-present.mean():+.3f} on average,"
                 f" {-present.max():+.3f} at worst; gradient estimate: rank correlation {rho:.2f}"
@@ -138,7 +138,7 @@ class Sensitivity:
         from diagnostics.decision.plot import draw_row, pads_figure
 
         figure, axes = pads_figure(self.layout, n_rows=len(self.values))
-        shown = np.where(self.layout.present.ravel(), self.accuracy_lost, np.nan)
+        shown = np.where(self.layout.is_cell, self.accuracy_lost, np.nan)
         for value, losses, row in zip(self.values, shown, axes, strict=True):
             # each value on its own scale: a short costs far more
             top = max(float(np.nanmax(losses)), 1 / self.n)
@@ -270,7 +270,7 @@ def _enumerate(
     n_cells = windows.x.shape[2]
     answer, n_classes = _answers(model, windows)
     layout = getattr(model, "layout", None)
-    present = layout.present.ravel() if isinstance(layout, SensorLayout) else np.ones(n_cells, bool)
+    present = layout.is_cell if isinstance(layout, SensorLayout) else np.ones(n_cells, bool)
     usual = _Tally(1, 1, n_classes)
     stuck = _Tally(len(levels), n_cells, n_classes)
     hide = None if progress is None else not progress

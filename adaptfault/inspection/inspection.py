@@ -155,7 +155,7 @@ def _disturbances(
     converter's range."""
     sentinel = find_sentinel(given, layout)
     found = [] if sentinel is None else [sentinel]
-    if any(np.isfinite(frames[:, layout.present.ravel()]).any() for frames in log):
+    if any(np.isfinite(frames[:, layout.is_cell]).any() for frames in log):
         return found + find_disturbances(log, healthy, layout)
     return [
         *found,
@@ -170,7 +170,7 @@ def _without_groups(
     where no other cell is left."""
     cells = [cell for fault in diagnosis.faults if fault.line is not None for cell in fault.cells]
     faulty = FaultSet(tuple(cells), diagnosis.layout.n_cells).mask
-    left = diagnosis.layout.present.ravel() & ~faulty
+    left = diagnosis.layout.is_cell & ~faulty
     if not cells or not left.any():
         return None
     return [np.where(faulty, np.nan, frames) for frames in log]

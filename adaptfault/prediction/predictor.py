@@ -250,7 +250,7 @@ class Predictor:
         if not self._accumulate:
             return None
         model = self._running.model
-        healthy = self.layout.present.ravel() & ~model.fault_set.mask
+        healthy = self.layout.is_cell & ~model.fault_set.mask
         return ContactDecision(model.contact, healthy, model.length)
 
     def reset(self) -> None:

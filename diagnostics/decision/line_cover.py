@@ -108,7 +108,7 @@ def solve(
     # Pads are independent of each other; a group may extend over several.
     part = layout.pad_of if layout.is_matrix else np.zeros(layout.n_cells, np.intp)
     for i in np.unique(part[consistent]).tolist():
-        on = layout.present.ravel() & (part == i)
+        on = layout.is_cell & (part == i)
         lines = [line for line in layout.lines if line.pad == i or not layout.is_matrix]
         causes += _explain(
             faulty & on, consistent & on, contradicting & on, weight, layout, lines, common

@@ -50,7 +50,7 @@ def draw(
     from matplotlib.patches import Patch
 
     figure, ((*axes,),) = pads_figure(layout, n_rows=1, scale=False, page=page)
-    colours = np.where(layout.present.ravel(), verdicts.astype(np.intp), 3)
+    colours = np.where(layout.is_cell, verdicts.astype(np.intp), 3)
     palette = ListedColormap([_ALIVE, _FAULTY, _UNTESTED, _ABSENT])
     cell_points = 72 * _cell(layout, page)
     for pad, ax in enumerate(axes):
@@ -129,7 +129,7 @@ def draw_row(
         bar: of the colour bar.
     """
     size = layout.n_cells // layout.pads
-    shown = layout.grid(np.where(layout.present.ravel(), values, np.nan))
+    shown = layout.grid(np.where(layout.is_cell, values, np.nan))
     marked = list(dead)
     for pad, ax in enumerate(axes):
         on_pad = [int(cell) % size for cell in marked if cell // size == pad]

@@ -180,13 +180,13 @@ class Diagnosis:
         both. On real grasps the two costs are equal at a probability of 0.02 for cells that read 0,
         and at 0.001 for full scale.
         """
-        likely = self.tested & (self.probability >= probability) & self.layout.present.ravel()
+        likely = self.tested & (self.probability >= probability) & self.layout.is_cell
         return FaultSet.of(likely | self.fault_set.mask, self.layout.n_cells)
 
     @cached_property
     def verdicts(self) -> NDArray[np.object_]:
         """Array ``[D]`` of :class:`Verdict`. A position without a cell is UNTESTED."""
-        code = np.where(self.tested & self.layout.present.ravel(), Verdict.ALIVE, Verdict.UNTESTED)
+        code = np.where(self.tested & self.layout.is_cell, Verdict.ALIVE, Verdict.UNTESTED)
         code[self.fault_set.mask] = Verdict.FAULTY
         # Enum members: NumPy would convert them to integers.
         return np.array(list(Verdict), dtype=object)[code]
@@ -231,7 +231,7 @@ class Diagnosis:
         signs = np.where(self.verdicts == Verdict.UNTESTED, "?", ".")
         for fault in self.faults:
             signs[list(fault.cells)] = LETTERS[fault.kind]
-        grid = self.layout.grid(np.where(self.layout.present.ravel(), signs, " "))
+        grid = self.layout.grid(np.where(self.layout.is_cell, signs, " "))
         names = [f"pad {pad + count_from}" for pad in range(self.layout.pads)]
         width = max(2 * self.layout.shape[2] - 1, len(names[-1]))
         lines = ["   ".join(["    ", *(name.ljust(width) for name in names)]).rstrip()]
@@ -280,7 +280,7 @@ class Diagnosis:
             kind[list(fault.cells)] = str(fault.kind)
             if fault.line is not None:
                 line[list(fault.cells)] = str(fault.line)
-        cells = np.flatnonzero(self.layout.present.ravel())
+        cells = np.flatnonzero(self.layout.is_cell)
         places = [self.layout.position(cell) for cell in cells.tolist()]
         pad, row, column = zip(*places, strict=True)
         axis = {"axis": cells % self.layout.axes} if self.layout.axes > 1 else {}

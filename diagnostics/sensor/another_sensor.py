@@ -136,7 +136,7 @@ def find_another_sensor(
     log = complete([recordings[i] for i in numbers], reference.scale.baseline)
     if min(len(log), len(usual)) < FEWEST:
         return None
-    used = layout.present.ravel() & (reference.dead == 0) & ~excluded
+    used = layout.is_cell & (reference.dead == 0) & ~excluded
     fit = Fit.of(reference, layout, used, usual)
     both = _Readings.of([*usual, *log], len(usual), fit)
     pads = [_Pad.of(both, on, len(usual), fit) for on in fit.pads if (on & used).any()]

@@ -134,7 +134,7 @@ def find_recalibration(
             other cells read otherwise too.
         rival: the recordings with wires put back, which must not explain the log better.
     """
-    used = layout.present.ravel() & ~excluded & (reference.dead == 0)
+    used = layout.is_cell & ~excluded & (reference.dead == 0)
     new = complete(recordings, reference.scale.baseline)
     old = complete(healthy, reference.scale.baseline)
     if reference.model is None or len(new) < _FEWEST or len(old) < _FEWEST:
@@ -257,7 +257,7 @@ class Fit:
     @property
     def pads(self) -> list[Mask]:
         """The cells of each pad, bool ``[D]``."""
-        present = self.layout.present.ravel()
+        present = self.layout.is_cell
         return [(self.layout.pad_of == i) & present for i in range(self.layout.pads)]
 
     def differ(self, on: Mask, one: Learned, other: Learned) -> bool:
@@ -300,7 +300,7 @@ class Fit:
 
         Cells that count as faulty are scored too: wires that are exchanged make them so.
         """
-        everywhere = replace(self, used=self.layout.present.ravel() & self.model.living)
+        everywhere = replace(self, used=self.layout.is_cell & self.model.living)
         on = np.any(pads, axis=0)
         ours = 0.0
         for (log_gain, offset), other in zip(of_halves, halves[::-1], strict=True):

@@ -222,7 +222,7 @@ def _bridge_partners(
         return None
     step = (index - line.index) * (layout.cols if line.kind == "row" else 1)
     partners = np.where(np.isin(cells, list(theirs)), cells - step, cells + step)
-    return np.where(layout.present.ravel()[partners], partners, -1)
+    return np.where(layout.is_cell[partners], partners, -1)
 
 
 def _blinking(frames: int, rng: np.random.Generator) -> NDArray[np.bool_]:

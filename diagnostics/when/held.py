@@ -139,7 +139,7 @@ class _Search:
             orders.append(np.argsort(classes, kind="stable"))
         self._spans = spans
         self._tolerance = tolerance
-        self._known = spans.known & layout.present.ravel()
+        self._known = spans.known & layout.is_cell
         nothing = Held.nothing(spans, tolerance)
         self._nothing = nothing
         self._moved = nothing.moved
@@ -147,7 +147,7 @@ class _Search:
         self._moves = np.sqrt(moves)
         self._exact = self._known & (spans.ranges <= 0)
         self._symbol = self._symbols(layout)
-        self._beside = np.where(layout.present.ravel()[layout.beside], layout.beside, -1)
+        self._beside = np.where(layout.is_cell[layout.beside], layout.beside, -1)
         self._beside[layout.beside < 0] = -1
         self._on, self._near = _lines(layout)
         self._cells = Mixture(self._symbol, _CONTEXTS, orders, classes)
@@ -312,7 +312,7 @@ def _lines(layout: SensorLayout) -> tuple[Floats, Floats]:
 
     Lines of few cells, and of most cells of the array, say nothing that their cells do not.
     """
-    present = layout.present.ravel()
+    present = layout.is_cell
     on: list[Floats] = []
     near: list[Floats] = []
     for line in layout.lines:

@@ -69,7 +69,7 @@ def _places(cells: NDArray[np.intp], layout: SensorLayout) -> str:
     """Return the lines and the other cells in words."""
     left = np.zeros(layout.n_cells, bool)
     left[cells] = True
-    present = layout.present.ravel()
+    present = layout.is_cell
     places = []
     for line in layout.lines:
         on = layout.cells_on(line)

@@ -128,7 +128,7 @@ def worst_faults(
     layout = adapter.layout
     index = np.flatnonzero(layout.present).tolist()
     wires = {
-        str(line): [int(c) for c in layout.cells_on(line) if layout.present.flat[c]]
+        str(line): layout.cells_on(line).tolist()
         for line in layout.lines
         if line.kind in ("row", "column")
     }

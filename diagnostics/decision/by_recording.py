@@ -195,7 +195,6 @@ def _held_faults(
     faults = []
     for line in layout.lines:
         cells = layout.cells_on(line)
-        cells = cells[layout.is_cell[cells]]
         one_set = len(cells) > 1 and left[cells].all()
         if one_set and (held.suspect[:, cells] == held.suspect[:, cells[:1]]).all():
             faults.append(_held_fault(cells, line, held, layout, tolerance))

@@ -23,6 +23,7 @@ REFUTED_KINDS = (
 # Those that a wire has which fails now and then, as one that opens under load.
 OF_WIRES = REFUTED_KINDS[:2]
 
+Cells = NDArray[np.intp]
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
@@ -67,21 +68,21 @@ class CellFindings:
     drifting: Mask
     gain: Floats
     value: Floats
-    since: NDArray[np.intp]
+    since: Cells
     probability: Floats
     weight: Floats
-    events: NDArray[np.intp]
+    events: Cells
     known: Mask
-    refuted: NDArray[np.intp]
-    unsure: NDArray[np.intp]
-    wire: NDArray[np.intp]
+    refuted: Cells
+    unsure: Cells
+    wire: Cells
     of_wire: Floats
     share: Floats
     as_one: Mask
     zero: Mask | None = None
     typical: Floats | None = None
 
-    def of(self, cells: NDArray[np.intp]) -> CellFindings:
+    def of(self, cells: Cells) -> CellFindings:
         """Return the findings in the order of ``cells``."""
         return replace(
             self,

@@ -51,6 +51,8 @@ _WIRES = "row", "column", "converter", "position", "bus", "group"
 _IN_MIDDLE = "row", "column"  # wires that may be broken in their middle
 _FEW = 8  # wires up to which all sets are enumerated: a size
 
+Cells = NDArray[np.intp]
+Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 
@@ -79,7 +81,7 @@ class Cause:
 @dataclass(frozen=True)
 class _Candidate:
     line: Line
-    cells: NDArray[np.intp]  # behind the break
+    cells: Cells  # behind the break
     cost: float
     whole: bool
     on_line: int  # cells on the wire, on either side of the break
@@ -89,7 +91,7 @@ def solve(
     faulty: Mask,
     consistent: Mask,
     contradicting: Mask,
-    weight: NDArray[np.float64],
+    weight: Floats,
     layout: SensorLayout,
     common: float = 0.0,
 ) -> tuple[Cause, ...]:
@@ -121,7 +123,7 @@ def _least_support(behind: int) -> int:
     return max(_MIN_OF_GROUP, min(_MIN_SUPPORT, -(-2 * behind // 3)))
 
 
-def _ends(line: Line, cells: NDArray[np.intp], contradicting: Mask) -> tuple[NDArray[np.intp], ...]:
+def _ends(line: Line, cells: Cells, contradicting: Mask) -> tuple[Cells, ...]:
     """Return the cells beyond the last working one, seen from either end of a wire; none if none
     works.
 
@@ -137,7 +139,7 @@ def _explain(
     faulty: Mask,
     consistent: Mask,
     contradicting: Mask,
-    weight: NDArray[np.float64],
+    weight: Floats,
     layout: SensorLayout,
     lines: Sequence[Line],
     common: float,
@@ -195,7 +197,7 @@ def _explain(
 
 def _candidates(
     line: Line,
-    cells: NDArray[np.intp],
+    cells: Cells,
     contradicting: Mask,
     supporting: Mask,
     faulty: Mask,
@@ -203,10 +205,10 @@ def _candidates(
     """Return the wire broken as a whole, and in its middle with either end working, where enough
     cells support it."""
 
-    def proven(behind: NDArray[np.intp]) -> bool:
+    def proven(behind: Cells) -> bool:
         return bool(supporting[behind].sum() >= _least_support(len(behind)))
 
-    def cost(behind: NDArray[np.intp]) -> float:
+    def cost(behind: Cells) -> float:
         return float(_LINE_COST + (0.0 if faulty[behind].any() else PROVEN))
 
     contradictions = int(contradicting[cells].sum())
@@ -226,7 +228,7 @@ def _candidates(
     return found
 
 
-def _discount(candidates: Sequence[_Candidate], uncertain: Mask) -> NDArray[np.float64]:
+def _discount(candidates: Sequence[_Candidate], uncertain: Mask) -> Floats:
     """Return the discount c of the evidence of each uncertain cell, ``[D]``: the inverse of Kish's
     design effect."""
     discount = np.ones(len(uncertain))
@@ -237,16 +239,16 @@ def _discount(candidates: Sequence[_Candidate], uncertain: Mask) -> NDArray[np.f
     return discount
 
 
-def _gain(c: _Candidate, faulty: Mask, support: NDArray[np.float64], cell_cost: float) -> float:
+def _gain(c: _Candidate, faulty: Mask, support: Floats, cell_cost: float) -> float:
     uncertain = c.cells[~faulty[c.cells]]
     return float(faulty[c.cells].sum()) * cell_cost + float(support[uncertain].sum()) - c.cost
 
 
 def _cheapest(
     candidates: Sequence[_Candidate],
-    found: NDArray[np.intp],
+    found: Cells,
     faulty: Mask,
-    support: NDArray[np.float64],
+    support: Floats,
     cell_cost: float,
     least: float = PROVEN,
 ) -> list[_Candidate]:
@@ -268,7 +270,7 @@ def _cheapest(
     return [c for c in candidates if _gain(c, faulty, support, cell_cost) > least]
 
 
-def cheapest_of_few(cost: NDArray[np.float64], covers: Mask, saves: NDArray[np.float64]) -> Mask:
+def cheapest_of_few(cost: Floats, covers: Mask, saves: Floats) -> Mask:
     """Return the set of wires of least cost, bool ``[wires]``, by enumeration.
 
     Args:
@@ -283,7 +285,7 @@ def cheapest_of_few(cost: NDArray[np.float64], covers: Mask, saves: NDArray[np.f
     return best
 
 
-def cheapest_of_many(cost: NDArray[np.float64], covers: Mask, saves: NDArray[np.float64]) -> Mask:
+def cheapest_of_many(cost: Floats, covers: Mask, saves: Floats) -> Mask:
     """Return the same set by integer programming: slower for few wires, feasible for many."""
     from scipy import sparse
     from scipy.optimize import Bounds, LinearConstraint, milp

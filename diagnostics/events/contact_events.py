@@ -43,6 +43,8 @@ _PERSISTING = 0.65  # share of the loaded cells that hold their value: then the 
 _SAME_PLACE = 0.6  # cosine between mean loads from which on two events load the same cells
 THE_SAME = 0.95  # cosine from which on they are the same
 
+Cells = NDArray[np.intp]
+
 
 @dataclass(frozen=True)
 class Summary:
@@ -160,7 +162,7 @@ class ContactEvent:
         size = float(np.sqrt((before @ before) * (now @ now)))
         return size <= _MIN_AMPLITUDE**2 or float(before @ now) >= _SAME_PLACE * size
 
-    def persists(self, part: Summary, root_near: float, start: NDArray[np.intp]) -> bool:
+    def persists(self, part: Summary, root_near: float, start: Cells) -> bool:
         """Return whether most of its loaded cells hold the same value in ``part``; see
         ``EventLog.extend``.
 
@@ -201,9 +203,7 @@ class EventLog:
     releasing: bool = False
     last: Array | None = None
 
-    def extend(
-        self, root: Array, numbers: NDArray[np.intp], root_near: float, start: NDArray[np.intp]
-    ) -> EventLog:
+    def extend(self, root: Array, numbers: Cells, root_near: float, start: Cells) -> EventLog:
         """Return the events after more frames.
 
         Args:
@@ -266,9 +266,9 @@ class EventLog:
         self,
         root: Array,
         before: Array,
-        numbers: NDArray[np.intp],
+        numbers: Cells,
         root_near: float,
-        start: NDArray[np.intp],
+        start: Cells,
     ) -> list[int]:
         """Return the frames in which a load vanishes and another appears elsewhere, as where a
         recording begins."""
@@ -302,7 +302,7 @@ def count_repeats(
     events: Sequence[ContactEvent],
     least: float = _SAME_PLACE,
     among: NDArray[np.bool_] | slice = slice(None),
-) -> NDArray[np.intp]:
+) -> Cells:
     """Return for each event the number of earlier events that load about the same cells, int
     ``[n]``.
 

@@ -38,7 +38,9 @@ from diagnostics.preprocessing.readings import SEGMENT
 if TYPE_CHECKING:
     from diagnostics.preprocessing.scale import Array, Scale
 
+Cells = NDArray[np.intp]
 Floats = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 
 _FOLDS = 4
 _BLINK_RATE = 0.05  # blinks per loaded frame of a loose contact
@@ -71,7 +73,7 @@ class _Counts(NamedTuple):
     blinks: Floats
     loaded: Floats
     noise: Floats
-    level: NDArray[np.intp]
+    level: Cells
 
     @classmethod
     def of(
@@ -202,10 +204,10 @@ class Intermittency:
     layout: SensorLayout
     blinking: Floats
     noisy: Floats
-    blinks: NDArray[np.intp]
-    high: NDArray[np.intp]
-    blinks_since: NDArray[np.intp]
-    noisy_since: NDArray[np.intp]
+    blinks: Cells
+    high: Cells
+    blinks_since: Cells
+    noisy_since: Cells
     lowest: float = np.inf
 
     @classmethod
@@ -219,12 +221,12 @@ class Intermittency:
         self,
         frames: Floats,
         root: Array,
-        numbers: NDArray[np.intp],
+        numbers: Cells,
         scale: Scale,
         usual: HealthyRates,
-        constant: NDArray[np.bool_],
+        constant: Mask,
         full: float = _MAX,
-        begins: NDArray[np.bool_] | None = None,
+        begins: Mask | None = None,
     ) -> Intermittency:
         """Return the sums after one more segment.
 
@@ -276,9 +278,7 @@ class Intermittency:
             lowest,
         )
 
-    def _noisier(
-        self, noise: Floats, limit: Floats, moving: NDArray[np.intp], alone: bool
-    ) -> NDArray[np.bool_]:
+    def _noisier(self, noise: Floats, limit: Floats, moving: Cells, alone: bool) -> Mask:
         """Return which of the ``moving`` cells have more noise than the limit, bool ``[D]``;
         ``alone``: unshared."""
         noisier = np.zeros(self.layout.n_cells, bool)
@@ -292,21 +292,19 @@ class Intermittency:
         return noisier
 
     @property
-    def intermittent(self) -> NDArray[np.bool_]:
+    def intermittent(self) -> Mask:
         """bool ``[D]``, intermittent cells."""
-        found: NDArray[np.bool_] = (self.blinking >= _THRESHOLD) & (self.blinking > self.noisy)
+        found: Mask = (self.blinking >= _THRESHOLD) & (self.blinking > self.noisy)
         return found
 
     @property
-    def excess(self) -> NDArray[np.bool_]:
+    def excess(self) -> Mask:
         """bool ``[D]``, cells with excess noise that are not intermittent."""
-        found: NDArray[np.bool_] = (self.noisy >= _THRESHOLD) & ~self.intermittent
+        found: Mask = (self.noisy >= _THRESHOLD) & ~self.intermittent
         return found
 
 
-def _of_some_length(
-    frames: Floats, root: Array, recording: NDArray[np.intp]
-) -> tuple[Floats, Array, NDArray[np.intp]]:
+def _of_some_length(frames: Floats, root: Array, recording: Cells) -> tuple[Floats, Array, Cells]:
     """Return the frames, root loads and numbers ``[t]`` of the recordings without those of which
     there are too few frames here to tell of time."""
     enough = np.bincount(recording)[recording] >= SHORTEST_RUN
@@ -317,12 +315,12 @@ def _measure(
     frames: Floats,
     root: Array,
     scale: Scale,
-    cells: NDArray[np.intp],
+    cells: Cells,
     layout: SensorLayout,
     alone: bool,
     lowest: float,
-    recording: NDArray[np.intp] | None = None,
-) -> tuple[NDArray[np.intp], NDArray[np.intp], Floats, Floats, NDArray[np.intp]]:
+    recording: Cells | None = None,
+) -> tuple[Cells, Cells, Floats, Floats, Cells]:
     """Return for each of the ``cells``: blinks to the baseline, blinks to full scale, loaded
     frames, noise, load level.
 
@@ -360,13 +358,13 @@ def _measure(
 
 def _blinks(
     x: Array,
-    initial: NDArray[np.bool_],
-    away: NDArray[np.bool_],
-    recording: NDArray[np.intp] | None,
+    initial: Mask,
+    away: Mask,
+    recording: Cells | None,
     every: Floats | None,
-    beside: NDArray[np.intp],
-    cells: NDArray[np.intp],
-) -> NDArray[np.intp]:
+    beside: Cells,
+    cells: Cells,
+) -> Cells:
     """Return how often each cell is away in one step and back in one step, to about the same load
     ``x [t, n]``: no contact does that.
 
@@ -415,7 +413,7 @@ def _lowest_load(frames: Floats, scale: Scale) -> float:
     return float(np.min(load, where=load > scale.near, initial=np.inf))
 
 
-def _shared(neighbours: NDArray[np.intp], change: Floats, own: Floats | Array) -> NDArray[np.bool_]:
+def _shared(neighbours: Cells, change: Floats, own: Floats | Array) -> Mask:
     """Return which changes of single cells a neighbour shares, bool ``[n]``.
 
     Exactly both neighbours on one row, or on one column, do not count: they may lie on the same bad

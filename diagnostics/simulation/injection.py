@@ -35,6 +35,9 @@ _PERIODS = (12.0, 100.0)  # FLOATING: frames of one swing, drawn between these
 _OPENS = 0.2
 _CLOSES = 0.4
 
+Cells = NDArray[np.intp]
+Floats = NDArray[np.float64]
+
 
 def inject(
     recording: ArrayLike,
@@ -45,7 +48,7 @@ def inject(
     dither: float = 0.0,
     until: int | None = None,
     gain: float = 0.0,
-) -> NDArray[np.float64]:
+) -> Floats:
     """Return a copy of ``recording`` with ``faults`` injected, each from its onset on.
 
     Faults are applied in order; every one reads the healthy recording, so an alias copies what the
@@ -96,13 +99,13 @@ def inject(
 
 def _faulty_readings(
     fault: Fault,
-    cells: NDArray[np.intp],
-    healthy: NDArray[np.float64],  # [t, D], while the fault lasts
+    cells: Cells,
+    healthy: Floats,  # [t, D], while the fault lasts
     layout: SensorLayout,
     rng: np.random.Generator,
     dither: float,
     gain: float,
-) -> NDArray[np.float64]:
+) -> Floats:
     """Return what ``cells`` read under ``fault``, ``[t, len(cells)]``."""
     own = healthy[:, cells]
     full_scale = layout.full_scale
@@ -118,9 +121,7 @@ def _faulty_readings(
             partners = _bridge_partners(fault, cells, layout)
             sources = _alias_sources(fault, cells, layout) if partners is None else partners
             # Where nothing is connected, no current flows.
-            others: NDArray[np.float64] = np.where(
-                sources >= 0, healthy[:, np.maximum(sources, 0)], 0.0
-            )
+            others: Floats = np.where(sources >= 0, healthy[:, np.maximum(sources, 0)], 0.0)
             # Two cells in parallel: their conductances add, and so do their forces.
             return others if partners is None else own + others
         case FaultKind.INTERMITTENT:
@@ -132,13 +133,13 @@ def _faulty_readings(
             return own + rng.normal(0.0, value, own.shape)
         case FaultKind.DRIFT:
             frames = np.arange(1, len(own) + 1)[:, None]
-            drifted: NDArray[np.float64] = (
+            drifted: Floats = (
                 own * (1.0 + gain / layout.rate * frames) + value / layout.rate * frames
             )
             return drifted
         case FaultKind.FLOATING:
             swing = value * _swinging(own.shape, rng)
-            floating: NDArray[np.float64] = np.fmin.reduce(own, initial=np.inf) + swing
+            floating: Floats = np.fmin.reduce(own, initial=np.inf) + swing
             return floating
         case FaultKind.LATE:
             return own[np.maximum(np.arange(len(own)) - int(value), 0)]
@@ -148,23 +149,21 @@ def _faulty_readings(
             return np.minimum(own, value)
         case FaultKind.WEAK:
             lowest = np.fmin.reduce(own, initial=np.inf)
-            weakened: NDArray[np.float64] = lowest + value * (own - lowest)
+            weakened: Floats = lowest + value * (own - lowest)
             return weakened
 
 
-def _swinging(shape: tuple[int, ...], rng: np.random.Generator) -> NDArray[np.float64]:
+def _swinging(shape: tuple[int, ...], rng: np.random.Generator) -> Floats:
     """Return a sine from 0 to 1 for each cell, ``[t, cells]``, each with a period and a phase of
     its own."""
     period = rng.uniform(*_PERIODS, shape[1])
     phase = rng.uniform(0.0, 1.0, shape[1])
     turns = np.arange(shape[0])[:, None] / period + phase
-    swing: NDArray[np.float64] = (1.0 + np.sin(2 * np.pi * turns)) / 2
+    swing: Floats = (1.0 + np.sin(2 * np.pi * turns)) / 2
     return swing
 
 
-def _copied(
-    fault: Fault, cells: NDArray[np.intp], healthy: NDArray[np.float64], layout: SensorLayout
-) -> NDArray[np.float64]:
+def _copied(fault: Fault, cells: Cells, healthy: Floats, layout: SensorLayout) -> Floats:
     """Return what the cells of a COPY fault read, ``[t, cells]``."""
     if fault.value is not None:
         # IndexError names a cell that is not there
@@ -179,7 +178,7 @@ def _copied(
     return copied
 
 
-def _alias_sources(fault: Fault, cells: NDArray[np.intp], layout: SensorLayout) -> NDArray[np.intp]:
+def _alias_sources(fault: Fault, cells: Cells, layout: SensorLayout) -> Cells:
     """Return the cell that each of ``cells`` reads instead of itself; -1: an address with nothing
     connected."""
     line = fault.line
@@ -201,9 +200,7 @@ def _alias_sources(fault: Fault, cells: NDArray[np.intp], layout: SensorLayout) 
     return np.array([layout.cell(pad, row, value) for pad, row, _ in positions])
 
 
-def _bridge_partners(
-    fault: Fault, cells: NDArray[np.intp], layout: SensorLayout
-) -> NDArray[np.intp] | None:
+def _bridge_partners(fault: Fault, cells: Cells, layout: SensorLayout) -> Cells | None:
     """Return the cell that each of ``cells`` is bridged with; -1: an absent one. None: the alias is
     not a bridge.
 
@@ -288,7 +285,7 @@ def line_fault(
 
 def _beyond(
     layout: SensorLayout, line: Line, kind: FaultKind, break_at: int, driven_from: str
-) -> tuple[NDArray[np.intp], str]:
+) -> tuple[Cells, str]:
     """Return the cells behind a break, and where these are, as text."""
     if line.kind not in ("row", "column"):
         raise ValueError(f"break_at is a position along a row or column; {line} has no positions")
@@ -350,9 +347,7 @@ def bridge(layout: SensorLayout, line: Line, *, onset: int | None = None) -> Fau
     )
 
 
-def freeze_stream(
-    recording: ArrayLike, onset: int, until: int | None = None
-) -> NDArray[np.float64]:
+def freeze_stream(recording: ArrayLike, onset: int, until: int | None = None) -> Floats:
     """Return a copy of ``recording`` ``[T, ...]`` that repeats frame ``onset`` to its end, or
     before frame ``until``.
 
@@ -368,9 +363,7 @@ def freeze_stream(
     return out
 
 
-def lose_frames(
-    recording: ArrayLike, share: float, *, seed: int | None = None
-) -> NDArray[np.float64]:
+def lose_frames(recording: ArrayLike, share: float, *, seed: int | None = None) -> Floats:
     """Return a copy of ``recording`` ``[T, ...]`` in which randomly chosen frames are missing: all
     NaN.
 

@@ -15,7 +15,7 @@ detected: what moves by itself, gains, wires of which no cell is tested.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -361,11 +361,8 @@ def _findings(
     beyond = spatial.scored & ~rests
     held = stream.reading(runs.value)
     tolerance = 2 * stream.reference.tolerance
-    since = np.select(
-        [silent, intermittent, noisy, drifting],
-        [runs.missed_since, frames.blinks_since, frames.noisy_since, 0],
-        runs.start,
-    )
+    unsaid: dict[str, Any] = dict.fromkeys(("refuted", "unsure", "wire"), np.full(len(held), -1))
+    unsaid |= dict.fromkeys(("of_wire", "share"), np.zeros(len(held)))
     return CellFindings(
         faulty=faulty,
         # A cell that moved is alive, unless it is suspected since.
@@ -378,15 +375,18 @@ def _findings(
         noisy=noisy,
         drifting=drifting,
         value=np.where(intermittent, stream.blinks_to(full_scale), held),
-        since=since,
+        since=np.select(
+            [silent, intermittent, noisy, drifting],
+            [runs.missed_since, frames.blinks_since, frames.noisy_since, 0],
+            runs.start,
+        ),
         probability=probability,
         # A cell at rest supports a broken line by the events alone, without the prior of its value.
         weight=np.where(known, CERTAIN_RATIO, weight),
         events=np.where(intermittent, frames.blinks, spatial.events),
         known=known,
         gain=np.full(len(held), np.nan),
-        **dict.fromkeys(("refuted", "unsure", "wire"), np.full(len(held), -1)),
-        **dict.fromkeys(("of_wire", "share"), np.zeros(len(held))),
+        **unsaid,
         as_one=np.zeros(len(held), bool),
         typical=stream.typical_reading(),
     )

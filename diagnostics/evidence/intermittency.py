@@ -61,7 +61,7 @@ _LEVELS = np.array([0.0, 0.05, 0.2, 0.4, 0.6, 0.8])
 # share of the loaded cells, and of all, that may be noisy together: with more the contact moves
 _CROWD = 0.25
 _THRESHOLD = 14.0  # of the CUSUM: a prior of one in a thousand, and P(faulty) = 0.999
-_QUIET = np.log((1 - _NOISY_SHARE) / (1 - _RARE))  # log ratio of a segment below the limit
+_QUIET = float(np.log((1 - _NOISY_SHARE) / (1 - _RARE)))  # log ratio of a segment below the limit
 _MAX = 40.0  # upper limit of the CUSUM, so that a repaired cell is cleared soon
 _HEALTHY = 0.99  # quantile of the cells, of the largest CUSUM in the reference
 

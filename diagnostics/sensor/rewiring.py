@@ -147,9 +147,10 @@ def find_rewiring(
         gain = found.by_piece - now.by_piece
         if lead < LIMIT / 2 or not test.proves(gain, best.source, source, found.faulty):
             break
-        random = float(test.score(anywhere, found.faulty).by_piece.sum()) if best.turned else 0.0
-        if best.turned and gain.sum() < _TURNED * (sums[i] - random) / layout.pads:
-            break
+        if best.turned:
+            lost = sums[i] - float(test.score(anywhere, found.faulty).by_piece.sum())
+            if gain.sum() < _TURNED * lost / layout.pads:
+                break
         source = best.source
         total += float(gain.sum())
         steps.append(best.text)

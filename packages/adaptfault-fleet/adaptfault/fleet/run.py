@@ -81,7 +81,7 @@ def maintain_fleet(
     _check(jobs, dask, limit, keys, sign)
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    options = {
+    options: dict[str, Any] = {
         "dry_run": dry_run,
         "budget": budget,
         "least_serial": least_serial,

@@ -97,11 +97,8 @@ def members(groups: Any, n_cells: int) -> dict[str, Cells]:
             raise ValueError(f"group {name!r} contains itself: {' > '.join((*outer, name))}")
         if name not in found:
             given = groups[name]
-            if (
-                isinstance(given, str | Mapping)
-                or not isinstance(given, Sequence | np.ndarray)
-                or not len(given)
-            ):
+            is_list = isinstance(given, Sequence | np.ndarray) and not isinstance(given, str)
+            if not is_list or not len(given):
                 raise ValueError(
                     f"group {name!r} needs a list of cells or of names of groups; got"
                     f" {str(given)[:60]}"

@@ -165,7 +165,7 @@ class Adapter(FaultFreeModel):
         if method not in get_args(Method):
             raise ValueError(f"unknown method {method!r}: use one of {', '.join(get_args(Method))}")
         fault_set = FaultSet.of(fault_set, self.train.x.shape[2])
-        if not self.layout.present.ravel()[fault_set.healthy].any():
+        if not self.layout.is_cell[fault_set.healthy].any():
             raise ValueError(
                 f"F holds all {int(self.layout.present.sum())} cells: no healthy one is left to"
                 " predict from; replace the sensor"

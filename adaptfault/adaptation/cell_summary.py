@@ -37,7 +37,7 @@ class CellSummary(nn.Module):
     def __init__(self, layout: SensorLayout, fault_set: FaultSet) -> None:
         super().__init__()
         self.pads, self.rows, self.cols = layout.shape
-        present = layout.present.ravel()
+        present = layout.is_cell
         healthy = fault_set.healthy
         # Where each position of the grid is found in the healthy cells, with a zero behind them for
         # those that lack.

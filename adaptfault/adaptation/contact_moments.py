@@ -35,9 +35,7 @@ class ContactMoments(nn.Module):
             [[(rows - 1) / 2], [(cols - 1) / 2]]
         )
         products = np.stack([np.ones_like(x), y, x, y * y, x * x, y * x], axis=1).astype(np.float32)
-        self.register_buffer(
-            "present", torch.from_numpy(layout.present.ravel().copy()), persistent=False
-        )
+        self.register_buffer("present", torch.from_numpy(layout.is_cell.copy()), persistent=False)
         self.register_buffer("products", torch.from_numpy(products), persistent=False)
 
     def forward(self, x: Tensor) -> Tensor:

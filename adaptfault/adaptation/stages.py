@@ -77,7 +77,6 @@ class Run:
         self.seed = seed
         self.progress = progress
         self.budget = budget
-        self.device = device_of(fault_free.model)
         # accuracy without faults; standard errors that a gain has to exceed
         self.healthy = healthy
         self.noise = 0.0
@@ -166,7 +165,7 @@ class Run:
 
     def scratch(self) -> None:
         """Train a new network behind the linear front end, as the paper does for each F."""
-        fresh = self.fault_free.fresh(self.seed + 1).to(self.device)
+        fresh = self.fault_free.fresh(self.seed + 1)
         self.reduced = self._behind(self.fault_free.imputation.linear(self.fault_set), fresh)
         self.stages.clear()
         began = time.perf_counter()
@@ -307,7 +306,7 @@ class Run:
         """Return the reduced model of a front end and a network, on the device of the adapter."""
         rest = self.fault_free.rest
         reduced = ReducedModel(network, self.fault_set, front, rest=rest)
-        return reduced.to(self.device).eval()
+        return reduced.to(device_of(self.fault_free.model)).eval()
 
     def _quickly(self, reduced: ReducedModel) -> ReducedModel:
         """Return the same model with its network in low-rank form, if there is one for these
@@ -323,11 +322,12 @@ class Run:
     def _views(self, reduced: ReducedModel, windows: Windows) -> Views:
         """Return the views of windows, computed in batches, on the device of the adapter."""
         quick = self._quickly(reduced.eval())
+        device = device_of(self.fault_free.model)
         with torch.no_grad():
             views = []
             for x, extra in batches(as_tensor(windows.x), windows.extra, _BATCH):
-                others = {name: values.to(self.device) for name, values in extra.items()}
-                views.append(quick.views(x.to(self.device), **others))
+                others = {name: values.to(device) for name, values in extra.items()}
+                views.append(quick.views(x.to(device), **others))
         return Views(*(torch.cat(parts) for parts in zip(*views, strict=True)))
 
     def _too_long(self, reduced: ReducedModel, n: int) -> bool:

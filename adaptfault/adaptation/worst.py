@@ -93,7 +93,7 @@ class WorstFaults:
     def plot(self) -> Any:
         """Draw what each cell costs with the worse of its two wires; return the matplotlib
         figure."""
-        from diagnostics.decision.plot import draw_forces, pads_figure
+        from diagnostics.decision.plot import draw_row, pads_figure
 
         lost = np.full(self.layout.n_cells, np.nan)
         for loss in self.wires:
@@ -103,17 +103,9 @@ class WorstFaults:
             )
         figure, axes = pads_figure(self.layout, n_rows=1)
         top = max(float(np.nanmax(lost)), 1e-3)
-        for pad, ax in enumerate(axes[0]):
-            image = draw_forces(
-                ax, self.layout.grid(lost)[pad], self.layout, vmin=0, vmax=top, cmap="Reds"
-            )
-            ax.set_title(f"pad {pad}", fontsize=9)
-        figure.colorbar(
-            image,
-            ax=axes[0].tolist(),
-            label=f"{'R2' if self.measure == 'R2' else 'P(true class)'} lost after repair, worse"
-            " wire",
-        )
+        what = "R2" if self.measure == "R2" else "P(true class)"
+        label = f"{what} lost after repair, worse wire"
+        draw_row(axes[0], lost, self.layout, top=top, cmap="Reds", label=label)
         return figure
 
 
@@ -136,7 +128,7 @@ def worst_faults(
     layout = adapter.layout
     index = np.flatnonzero(layout.present).tolist()
     wires = {
-        str(line): [int(c) for c in layout.cells_on(line) if layout.present.flat[c]]
+        str(line): layout.cells_on(line).tolist()
         for line in layout.lines
         if line.kind in ("row", "column")
     }

@@ -3,18 +3,14 @@ torch."""
 
 from __future__ import annotations
 
-import logging
 import os
 import re
 import shutil
 import time
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Sequence
 from contextlib import AbstractContextManager, suppress
-from dataclasses import replace
-from datetime import datetime, timezone
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
-from uuid import uuid4
 
 from adaptfault.bundle.checksummed_json import (
     Damaged,
@@ -26,18 +22,17 @@ from adaptfault.bundle.checksummed_json import (
     write_files,
     write_with_copy,
 )
-from adaptfault.bundle.journal import Entry, Journal
+from adaptfault.bundle.journal import Entry, now
 from adaptfault.bundle.known_faults import KnownFaults
-from adaptfault.bundle.lock import PATIENCE, locked
-from adaptfault.bundle.parts import Parts, split_validation
-from adaptfault.bundle.pointer import NAME as POINTER
+from adaptfault.bundle.lock import locked
+from adaptfault.bundle.parts import Parts, check_parts, split_validation
 from adaptfault.bundle.pointer import SCHEMA as POINTER_SCHEMA
-from adaptfault.bundle.pointer import STARTS, Pointer
+from adaptfault.bundle.pointer import Pointer
+from adaptfault.bundle.running import Running
 from adaptfault.bundle.signature import sign_versions, verify
-from adaptfault.bundle.versions import Version, Versions
+from adaptfault.bundle.versions import Version
 from adaptfault.data.atomic import make_folder, sync, sync_tree
-from adaptfault.data.shortage import is_shortage
-from adaptfault.models.store import InMemory, check_names
+from adaptfault.models.store import InMemory
 from diagnostics import FaultSet, SelfDiagnosis, SensorLayout
 
 if TYPE_CHECKING:
@@ -57,19 +52,13 @@ WITHOUT_ONNX = "without_onnx"
 _ABOUT = "bundle.json"
 _PARTS = "parts"
 _MAINTENANCE_LOCK = "maintenance.lock"
-_STATE_LOCK = "state.lock"
-
-PROCESS = uuid4().hex  # identifies this process in the count of starts
-_log = logging.getLogger(__name__)
 # names that atomic_write makes
 _TEMPORARY = re.compile(r"\.(bundle|current|journal)\..*\.[a-z0-9_]{8}")
 _ABANDONED = 3600  # seconds
-# seconds that a confirmation, which runs in the robot's loop, waits for another process
-_IN_LOOP = 0.1
 _KEPT = 5  # latest versions that stay on the disk, besides the fault-free one
 
 
-class Bundle:
+class Bundle(Running):
     """Network, layout, calibration, healthy reference, stored windows, versions and history of one
     robot's sensor.
 
@@ -108,7 +97,7 @@ class Bundle:
         keys: Sequence[str | os.PathLike[str]] | None = None,
         least_serial: int = 0,
     ) -> None:
-        self.path = Path(path)
+        super().__init__(Path(path))
         with reading(self.path):
             there = any((self.path / name).is_file() for name in (_ABOUT, "bundle.copy.json"))
         if not there:
@@ -121,8 +110,6 @@ class Bundle:
             self.layout = SensorLayout.from_dict(self.about["layout"])
             self.class_names: tuple[str, ...] = tuple(map(str, self.about["class_names"]))
             self.parts = Parts(self.path / _PARTS, dict(self.about["parts"]))
-        self.versions = Versions(self.path / "versions")
-        self.journal = Journal(self.path)
         self.serial = 0  # of the signature that was verified, or written here
         if keys is not None:
             self.serial, self.versions.signed = verify(self.path, self.about, keys, least_serial)
@@ -174,7 +161,9 @@ class Bundle:
                 kind, the diagnoser is not fitted, or ``head`` is unknown.
         """
         path = Path(path)
-        _check_parts(path, model, adapter, diagnoser, class_names, check)
+        if path.exists():
+            raise FileExistsError(f"{path} exists: choose another name, or remove it")
+        check_parts(model, adapter, diagnoser, class_names, check)
         if head not in ("auto", "linear"):
             raise ValueError(f"unknown head {head!r}: use 'auto' or 'linear'")
         make_folder(path.parent)
@@ -182,8 +171,8 @@ class Bundle:
         shutil.rmtree(new, ignore_errors=True)  # left by a crash
         if check is None:
             adapter, check = split_validation(adapter)
-        parts = Parts.files(adapter, diagnoser, check, calibration, _graph(adapter))
-        about: dict[str, Any] = {
+        parts = Parts.files(adapter, diagnoser, check, calibration)
+        about = {
             "schema": SCHEMA,
             "layout": model.layout.to_dict(),
             "class_names": list(class_names),
@@ -201,77 +190,6 @@ class Bundle:
         os.replace(new, path)
         sync(path.parent)
         return cls(path)
-
-    # The active version.
-
-    @property
-    def pointer(self) -> Path:
-        """The file that names the active version; replaced at every switch."""
-        return self.path / POINTER
-
-    def active(self) -> Version:
-        """Return the active version; where it is damaged, the last valid one before it.
-
-        Raises:
-            Damaged: no version can be read.
-        """
-        problems = []
-        for number in self._candidates():
-            try:
-                return self.versions[number]
-            except (FileNotFoundError, Damaged) as error:
-                problems.append(str(error))
-        raise Damaged(f"{self.path} holds no version that can be read: {problems[0]}")
-
-    def _candidates(self) -> Iterator[int]:
-        """Yield the number of the active version, then those that replace it, the best first."""
-        pointer = Pointer.read(self.path)
-        first = dict.fromkeys((pointer.active, *pointer.fallbacks))
-        yield from first
-        for number in reversed(self.versions.numbers):
-            if number < pointer.active and number not in first:
-                yield number
-
-    def begin(self, starter: str = PROCESS) -> Version:
-        """Return the version to run and count the start while that version is on probation.
-
-        A version that was started twice without :meth:`confirm` is replaced by the one before it.
-
-        Args:
-            starter: identifies the caller. Consecutive starts by the same starter count once,
-                because one process may serve several devices.
-        """
-        try:
-            with locked(self.path / _STATE_LOCK):
-                pointer = Pointer.read(self.path)
-                after = pointer.started(starter)
-                if after.starts > STARTS and pointer.fallbacks:
-                    self._fall_back(
-                        pointer,
-                        f"version {pointer.active} was started {STARTS} times and never confirmed",
-                    )
-                elif after != pointer:
-                    after.write(self.path)
-        except (
-            OSError
-        ) as error:  # a full or read-only disk, or a stopped process, must not stop the prediction
-            _log.warning("%s cannot be written, so this start is not counted: %s", self.path, error)
-        return self.active()
-
-    def confirm(self) -> None:
-        """End the probation of the active version.
-
-        Raises:
-            OSError: the bundle cannot be written, or another process holds it; the version stays on
-                probation.
-        """
-        if not Pointer.read(self.path).probation:
-            return
-        with locked(self.path / _STATE_LOCK, patience=_IN_LOOP):
-            pointer = Pointer.read(self.path)
-            if pointer.probation:
-                entry = Entry(now(), "confirmed", {"version": pointer.active})
-                self._switch(pointer, pointer.confirmed(), entry, patience=_IN_LOOP)
 
     def deploy(
         self,
@@ -291,8 +209,7 @@ class Bundle:
         Raises:
             OSError: the bundle cannot be written, or another process holds it.
         """
-        with locked(self.path / _STATE_LOCK):
-            pointer = Pointer.read(self.path)
+        with self._state() as pointer:
             after = pointer.deployed(number)
             if sign is not None:
                 self.sign(sign, pointer.versions | after.versions)
@@ -319,18 +236,6 @@ class Bundle:
             before=self.serial,
             serial=serial,
         )
-
-    def rollback(self) -> Version:
-        """Return to the previous version. The fault set of the rejected one is not deployed again.
-
-        Raises:
-            ValueError: there is no previous version.
-            OSError: the bundle cannot be written, or another process holds it.
-        """
-        with locked(self.path / _STATE_LOCK):
-            pointer = Pointer.read(self.path)
-            self._fall_back(pointer, f"version {pointer.active} was rolled back")
-        return self.active()
 
     def problems(self, *, repair: bool = True) -> list[str]:
         """Check every file and return the damage; ``repair`` restores what has a copy.
@@ -364,30 +269,6 @@ class Bundle:
                     and time.time() - path.stat().st_mtime > _ABANDONED
                 ):
                     path.unlink()
-
-    def _fall_back(self, pointer: Pointer, reason: str) -> None:
-        try:
-            rejected = self.versions[pointer.active].fault_set.cells
-        except (FileNotFoundError, Damaged):
-            rejected = ()
-        after = pointer.fallen_back(rejected)
-        document = {"from": pointer.active, "to": after.active, "reason": reason}
-        self._switch(pointer, after, Entry(now(), "rollback", document))
-
-    def _switch(
-        self, before: Pointer, after: Pointer, entry: Entry, patience: float = PATIENCE
-    ) -> None:
-        """Replace the pointer and journal the entry: both, or neither. Needs the lock of the
-        state."""
-        self.journal.prepare(entry, before.entry)
-        replace(after, entry=entry.key).write(self.path)
-        self.journal.settle(entry.key, patience=patience)
-
-    def _settle(self) -> None:
-        """Move entries that wait into the journal, as after a crash."""
-        if self.journal.waits:
-            with locked(self.path / _STATE_LOCK):
-                self.journal.settle(Pointer.read(self.path).entry)
 
     def diagnoser(self) -> SelfDiagnosis:
         """Return the fitted self-diagnosis; raises Damaged. Needs no torch."""
@@ -472,7 +353,7 @@ class Bundle:
         """Write an adaptation as a new version without activating it."""
         files = InMemory()
         adaptation.save(files)
-        if _lacks_memory_for_onnx(files, self.parts.graph):
+        if self.parts.lacks_memory_for_onnx(files):
             about = {**about, WITHOUT_ONNX: True}
         length = adaptation.model.network.length
         return self._write_version(files, length, adaptation.fault_set, about)
@@ -488,7 +369,7 @@ class Bundle:
             return None
         sealed = Sealed(version.folder, version.hashes)
         files = InMemory({name: sealed.read(name) for name in version.hashes})
-        if _lacks_memory_for_onnx(files, self.parts.graph):
+        if self.parts.lacks_memory_for_onnx(files):
             return None
         about = {name: value for name, value in version.about.items() if name != WITHOUT_ONNX}
         return self._write_version(files, version.length, version.fault_set, about)
@@ -508,72 +389,3 @@ class Bundle:
         needed = {1, pointer.active, *pointer.fallbacks[:_KEPT]}
         self.versions.sweep(keep={*self.versions.numbers[-_KEPT:], *needed})
         return version
-
-
-def now() -> str:
-    """Return the current UTC time as ISO 8601."""
-    return datetime.now(timezone.utc).isoformat(timespec="seconds")
-
-
-def _check_parts(
-    path: Path,
-    model: TactileTransformer | AnyModel,
-    adapter: Adapter,
-    diagnoser: SelfDiagnosis,
-    class_names: Sequence[str],
-    check: Windows | None,
-) -> None:
-    """Refuse parts that make no bundle, before anything is written; the errors are those of
-    :meth:`Bundle.create`."""
-    if path.exists():
-        raise FileExistsError(f"{path} exists: choose another name, or remove it")
-    if not diagnoser.layout.shape == adapter.model.layout.shape == model.layout.shape:
-        raise ValueError(
-            f"model, adapter and diagnoser need one array shape; got {model.layout} and"
-            f" {diagnoser.layout}"
-        )
-    if adapter.acts:
-        raise ValueError(
-            "a bundle holds a classifier or a regression of touch alone: store a policy with"
-            " save_adapter, or its repair with Adaptation.save"
-        )
-    check_names(class_names, model.n_classes, adapter.task)
-    if check is not None and check.y.shape[1:] != adapter.validation.y.shape[1:]:
-        raise ValueError(
-            f"check has targets [N{_more(check)}], the adapter [N{_more(adapter.validation)}]:"
-            " give windows with the same classes or values"
-        )
-
-
-def _more(windows: Windows) -> str:
-    return "".join(f", {size}" for size in windows.y.shape[1:])
-
-
-def _graph(adapter: Adapter) -> bytes | None:
-    """Return the ONNX graph that repairs of this adapter share, so that each is exported in a
-    second."""
-    from adaptfault.imputation.tiled_statistics import LARGE
-    from adaptfault.prediction.export import ExportError, graph_of
-
-    # a large array has another front end for each F
-    if not adapter.has_features or adapter.layout.n_cells > LARGE:
-        return None
-    with suppress(ImportError, ExportError):  # logged with version 1
-        return graph_of(adapter.model, values=adapter.task == "regression")
-    return None
-
-
-def _lacks_memory_for_onnx(files: InMemory, graph: bytes | None) -> bool:
-    """Add the ONNX file to those of a version, which runs on torch without it; return whether it is
-    missing for want of memory, so that a later run may add it."""
-    from adaptfault.prediction.export import ExportError, add_onnx
-
-    try:
-        add_onnx(files, graph)
-    except Exception as error:
-        lacks_memory = is_shortage(error)
-        if not lacks_memory and not isinstance(error, ImportError | ExportError):
-            raise
-        _log.warning("no ONNX export, this version runs on torch: %s", error)
-        return lacks_memory
-    return False

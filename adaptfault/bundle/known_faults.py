@@ -39,9 +39,7 @@ class KnownFaults:
     @property
     def fault_set(self) -> FaultSet:
         """F, the cells that a classifier must not use."""
-        return FaultSet(
-            tuple({cell for fault in self.faults for cell in fault.cells}), self.n_cells
-        )
+        return FaultSet.of([cell for fault in self.faults for cell in fault.cells], self.n_cells)
 
     def merged(self, diagnosis: Diagnosis) -> KnownFaults:
         """Return the known faults after one more log.
@@ -50,9 +48,7 @@ class KnownFaults:
         alive (six for an intermittent fault). A log that does not test the cell changes nothing.
         """
         now = diagnosis.fault_set
-        alive = FaultSet(
-            tuple(np.flatnonzero(diagnosis.verdicts == Verdict.ALIVE).tolist()), self.n_cells
-        )
+        alive = FaultSet.of(diagnosis.verdicts == Verdict.ALIVE, self.n_cells)
         proofs = {cell: self.proofs.get(cell, 0) + (cell in alive) for cell in self.fault_set - now}
         kept = []
         for fault in self.faults:

@@ -3,7 +3,8 @@ calibration, ONNX graph."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import logging
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING
@@ -11,7 +12,8 @@ from typing import TYPE_CHECKING
 from adaptfault.bundle.checksummed_json import Damaged, Sealed, decoding
 from adaptfault.data.atomic import atomic_write
 from adaptfault.data.recordings.formats.text import decoded
-from adaptfault.models.store import InMemory, load_arrays, save_arrays
+from adaptfault.data.shortage import is_shortage
+from adaptfault.models.store import InMemory, check_names, load_arrays, save_arrays
 from diagnostics import SelfDiagnosis
 
 if TYPE_CHECKING:
@@ -21,6 +23,10 @@ if TYPE_CHECKING:
     from adaptfault.adaptation.adapter import Adapter
     from adaptfault.data.calibration import Calibration
     from adaptfault.data.windows import Windows
+    from adaptfault.models.any_model import AnyModel
+    from adaptfault.models.network import TactileTransformer
+
+_log = logging.getLogger(__name__)
 
 _ADAPTER = "adapter"
 _REFERENCE = "reference"
@@ -50,10 +56,8 @@ class Parts:
         diagnoser: SelfDiagnosis,
         check: Windows,
         calibration: Calibration | None,
-        graph: bytes | None,
     ) -> dict[str, bytes]:
-        """Return the content of the files of new parts, by path; see
-        :func:`~adaptfault.prediction.export.graph_of` for ``graph``.
+        """Return the content of the files of new parts, by path.
 
         Raises:
             ValueError: the diagnoser is not fitted.
@@ -77,6 +81,7 @@ class Parts:
         }
         if calibration is not None:
             files[_CALIBRATION] = calibration.encode()
+        graph = _graph(adapter)
         if graph is not None:
             files[_GRAPH] = graph
         return files
@@ -178,6 +183,21 @@ class Parts:
             return self._files.read(_GRAPH)
         return None
 
+    def lacks_memory_for_onnx(self, files: InMemory) -> bool:
+        """Add the ONNX file to those of a version, which runs on torch without it; return whether
+        it is missing for want of memory, so that a later run may add it."""
+        from adaptfault.prediction.export import ExportError, add_onnx
+
+        try:
+            add_onnx(files, self.graph)
+        except Exception as error:
+            lacks_memory = is_shortage(error)
+            if not lacks_memory and not isinstance(error, ImportError | ExportError):
+                raise
+            _log.warning("no ONNX export, this version runs on torch: %s", error)
+            return lacks_memory
+        return False
+
 
 def split_validation(adapter: Adapter) -> tuple[Adapter, Windows]:
     """Return an adapter with every second validation recording of each class, and the windows of
@@ -197,3 +217,48 @@ def split_validation(adapter: Adapter) -> tuple[Adapter, Windows]:
         recordings = recordings[np.argsort(windows.y[first], kind="stable")]
     given = np.isin(windows.recording, recordings[1::2])
     return Adapter(adapter.model, adapter.train, windows.select(~given)), windows.select(given)
+
+
+def check_parts(
+    model: TactileTransformer | AnyModel,
+    adapter: Adapter,
+    diagnoser: SelfDiagnosis,
+    class_names: Sequence[str],
+    check: Windows | None,
+) -> None:
+    """Refuse parts that make no bundle, before anything is written; the errors are those of
+    :meth:`~adaptfault.bundle.bundle.Bundle.create`."""
+    if not diagnoser.layout.shape == adapter.model.layout.shape == model.layout.shape:
+        raise ValueError(
+            f"model, adapter and diagnoser need one array shape; got {model.layout} and"
+            f" {diagnoser.layout}"
+        )
+    if adapter.acts:
+        raise ValueError(
+            "a bundle holds a classifier or a regression of touch alone: store a policy with"
+            " save_adapter, or its repair with Adaptation.save"
+        )
+    check_names(class_names, model.n_classes, adapter.task)
+    if check is not None and check.y.shape[1:] != adapter.validation.y.shape[1:]:
+        raise ValueError(
+            f"check has targets [N{_more(check)}], the adapter [N{_more(adapter.validation)}]:"
+            " give windows with the same classes or values"
+        )
+
+
+def _more(windows: Windows) -> str:
+    return "".join(f", {size}" for size in windows.y.shape[1:])
+
+
+def _graph(adapter: Adapter) -> bytes | None:
+    """Return the ONNX graph that repairs of this adapter share, so that each is exported in a
+    second."""
+    from adaptfault.imputation.tiled_statistics import LARGE
+    from adaptfault.prediction.export import ExportError, graph_of
+
+    # a large array has another front end for each F
+    if not adapter.has_features or adapter.layout.n_cells > LARGE:
+        return None
+    with suppress(ImportError, ExportError):  # logged with version 1
+        return graph_of(adapter.model, values=adapter.task == "regression")
+    return None

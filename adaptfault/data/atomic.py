@@ -28,19 +28,8 @@ def atomic_write(path: str | os.PathLike[str], data: bytes) -> None:
     if path.exists() and not path.is_file() and not path.is_dir():
         path.write_bytes(data)
         return
-    descriptor, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    try:
-        with open(descriptor, "wb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        os.chmod(name, 0o644)  # mkstemp's 0600 would hide it from the robot's other users
-        os.replace(name, path)
-    except BaseException:
-        with contextlib.suppress(OSError):
-            os.unlink(name)
-        raise
-    sync(path.parent)  # the rename is durable once the folder is synchronised
+    with atomic_file(path) as new:
+        new.write_bytes(data)
 
 
 def atomic_figure(path: str | os.PathLike[str], figure: Any, *, dpi: int) -> None:
@@ -71,13 +60,13 @@ def atomic_file(path: str | os.PathLike[str]) -> Iterator[Path]:
         yield Path(name)
         with open(name, "rb+") as file:
             os.fsync(file.fileno())
-        os.chmod(name, 0o644)
+        os.chmod(name, 0o644)  # mkstemp's 0600 would hide it from the robot's other users
         os.replace(name, path)
     except BaseException:
         with contextlib.suppress(OSError):
             os.unlink(name)
         raise
-    sync(path.parent)
+    sync(path.parent)  # the rename is durable once the folder is synchronised
 
 
 @contextlib.contextmanager

@@ -104,7 +104,7 @@ class Calibration:
             raise ValueError(
                 f"tables for {self.n_cells} cells, but the layout has {layout.n_cells}"
             )
-        if (lacking := np.flatnonzero(layout.present.ravel() & ~self.calibrated)).size:
+        if (lacking := np.flatnonzero(layout.is_cell & ~self.calibrated)).size:
             raise ValueError(
                 f"cell {lacking[0]} has no table ({lacking.size} cells have none); calibrate it"
             )
@@ -194,7 +194,7 @@ class Calibration:
             _check_rows(path, cell, rows)
             raw[cell, : len(rows)] = [row[0] for row in rows]
             force[cell, : len(rows)] = [row[1] for row in rows]
-        wanted = np.ones(width, bool) if layout is None else layout.present.ravel()
+        wanted = np.ones(width, bool) if layout is None else layout.is_cell
         if (lacking := np.flatnonzero(wanted & np.isnan(raw[:, 0]))).size:
             what = f"cell {lacking[0]} has no points ({lacking.size} cells have none); calibrate it"
             raise InputError.at(path, what)

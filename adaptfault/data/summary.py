@@ -71,11 +71,11 @@ class Summary:
         """Present cells whose reading never changes: not loaded, or faulty."""
         with np.errstate(invalid="ignore"):
             constant = ~(self.highest > self.lowest)
-        return np.flatnonzero(constant & self.layout.present.ravel())
+        return np.flatnonzero(constant & self.layout.is_cell)
 
     def to_dict(self) -> dict[str, Any]:
         """Return a JSON-safe dict of the schema "adaptfault.info/1"."""
-        present = self.layout.present.ravel()
+        present = self.layout.is_cell
         return {
             "schema": SCHEMA,
             **members(self, "layout", "step", "silent", "classes", "inferred"),
@@ -90,7 +90,7 @@ class Summary:
         }
 
     def __str__(self) -> str:
-        layout, present = self.layout, self.layout.present.ravel()
+        layout, present = self.layout, self.layout.is_cell
         least = int(self.lengths.min())
         most = int(self.lengths.max())
         missing = int(self.missing[present].sum())
@@ -113,7 +113,7 @@ class Summary:
         return "\n".join([*lines, *(f"{'inferred':12s} {text}" for text in self.inferred)])
 
     def _readings(self) -> str:
-        present = self.layout.present.ravel()
+        present = self.layout.is_cell
         low = _least(self.lowest[present])
         high = _most(self.highest[present])
         if low is None or high is None:
@@ -144,23 +144,14 @@ class Summary:
 
     def plot(self) -> Figure:
         """Draw the mean and the peak of each cell, one map a pad; a cross marks a silent cell."""
-        from diagnostics.decision.plot import draw_forces, pads_figure
+        from diagnostics.decision.plot import draw_row, pads_figure
 
         layout = self.layout
         figure, axes = pads_figure(layout, n_rows=2)
-        size = layout.rows * layout.shape[2]
-        for (name, values), row in zip(
-            {"mean": self.mean, "peak": self.highest}.items(), axes, strict=True
-        ):
-            shown = np.where(layout.present.ravel(), values, np.nan)
-            top = _most(shown) or layout.full_scale
-            for pad, ax in enumerate(row):
-                silent = [int(c) - pad * size for c in self.silent if c // size == pad]
-                image = draw_forces(
-                    ax, layout.grid(shown)[pad], layout, silent, vmin=0, vmax=top, cmap="viridis"
-                )
-                ax.set_title(f"{name}, pad {pad}", fontsize=9)
-            figure.colorbar(image, ax=row.tolist(), label=layout.unit)
+        maps = {"mean, ": self.mean, "peak, ": self.highest}
+        for (title, values), row in zip(maps.items(), axes, strict=True):
+            top = _most(values[layout.is_cell]) or layout.full_scale
+            draw_row(row, values, layout, title, self.silent, top=top, label=layout.unit)
         if self.silent.size:
             figure.supxlabel("x: the reading of the cell never changes", fontsize=8)
         return figure
@@ -215,7 +206,7 @@ def summarise(
         lowest=np.where(seen, lowest, np.nan),
         highest=np.where(seen, highest, np.nan),
         rest=_rest(np.concatenate(sample)),
-        step=_step(np.concatenate(sample)[:, layout.present.ravel()]),
+        step=_step(np.concatenate(sample)[:, layout.is_cell]),
         missing=np.int64(sum(seen_frames)) - finite,
         classes=dict(classes or {}),
         inferred=inferred,

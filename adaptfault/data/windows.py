@@ -191,35 +191,24 @@ def make_windows(
     lengths = [len(recording) for recording in checked]
     of_frames = _targets_of_frames(targets, lengths)
     others = {name: _as_long(name, inputs, lengths) for name, inputs in extra.items()}
-    y: list[NDArray[Any]] = []
-    pieces: list[NDArray[np.float32]] = []
-    counts = np.zeros(len(recordings), dtype=np.int64)
-    longest = 0
-    for i, recording in enumerate(checked):
-        frames = hold_missing(scale(recording, layout))
-        longest = max(longest, len(frames))
-        if len(frames) >= length:
-            views = _cut(frames, length, stride)
-            pieces.append(views)
-            counts[i] = len(views)
-            y.append(of_frames[i][length - 1 :: stride])
-    if not pieces:
+    longest = max(lengths, default=0)
+    if longest < length:
         raise ValueError(
             f"no windows: a window needs {length} frames, the longest of {len(recordings)}"
             f" recordings has {longest}"
         )
-    x = np.ascontiguousarray(np.concatenate(pieces), dtype=np.float32)
-    cut = {
-        name: np.concatenate([_cut(of, length, stride) for of in inputs if len(of) >= length])
-        for name, inputs in others.items()
-    }
-    return Windows(x, np.concatenate(y), np.repeat(np.arange(len(recordings)), counts), cut)
+    x = _cut([hold_missing(scale(recording, layout)) for recording in checked], length, stride)
+    y = np.concatenate([of[length - 1 :: stride] for of in of_frames])
+    counts = [len(range(length, frames + 1, stride)) for frames in lengths]
+    cut = {name: _cut(inputs, length, stride) for name, inputs in others.items()}
+    return Windows(np.ascontiguousarray(x), y, np.repeat(np.arange(len(recordings)), counts), cut)
 
 
-def _cut(frames: NDArray[Any], length: int, stride: int) -> NDArray[Any]:
-    """Return the windows ``[n, length, ...]`` of frames ``[T, ...]``."""
-    views = np.lib.stride_tricks.sliding_window_view(frames, length, axis=0)[::stride]
-    return np.moveaxis(views, -1, 1)
+def _cut(each: Sequence[NDArray[Any]], length: int, stride: int) -> NDArray[Any]:
+    """Return the windows ``[n, length, ...]`` of the frames ``[T, ...]`` of each recording."""
+    long = [frames for frames in each if len(frames) >= length]
+    views = [np.lib.stride_tricks.sliding_window_view(frames, length, axis=0) for frames in long]
+    return np.concatenate([np.moveaxis(view[::stride], -1, 1) for view in views])
 
 
 def _as_long(name: str, inputs: Sequence[ArrayLike], lengths: Sequence[int]) -> list[NDArray[Any]]:

@@ -10,7 +10,7 @@ import numpy as np
 
 from adaptfault.pages.html_page import Picture, render
 from diagnostics import FaultSet
-from diagnostics.decision.plot import draw_forces, pads_figure
+from diagnostics.decision.plot import draw_row, pads_figure
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -77,21 +77,11 @@ def _draw_maps(result: DemoResult, page: float) -> Figure:
     """Draw mean forces as the paper's Figure 3, with a third row: the forces after imputation."""
     layout = result.recordings.layout
     figure, axes = pads_figure(layout, n_rows=len(result.maps), page=page)
-    masked = {
-        name: np.where(layout.present.ravel(), values, np.nan)
-        for name, values in result.maps.items()
-    }
     # One colour scale for all, from the healthy map: a short is then off the scale.
-    top = float(np.nanmax(masked["normal"])) or layout.full_scale
+    top = float(np.nanmax(result.maps["normal"][layout.is_cell])) or layout.full_scale
     marks = {"normal": FaultSet((), layout.n_cells), "broken": result.injected_set}
-    for (name, values), row in zip(masked.items(), axes, strict=True):
+    for (name, values), row in zip(result.maps.items(), axes, strict=True):
         dead = marks.get(name, result.diagnosis.fault_set)
-        for pad, ax in enumerate(row):
-            size = layout.rows * layout.shape[2]
-            on_pad = [c - pad * size for c in dead if c // size == pad]
-            image = draw_forces(
-                ax, layout.grid(values)[pad], layout, on_pad, vmin=0, vmax=top, cmap="viridis"
-            )
-            ax.set_title(f"{name}, pad {pad}", fontsize=9)
-        figure.colorbar(image, ax=row.tolist(), label=layout.unit, extend="max")
+        title = f"{name}, "
+        draw_row(row, values, layout, title, dead, top=top, label=layout.unit, extend="max")
     return figure

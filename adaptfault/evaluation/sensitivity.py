@@ -101,7 +101,7 @@ class Sensitivity:
         cells, ``[V]``."""
         from scipy.stats import spearmanr
 
-        present = self.layout.present.ravel()
+        present = self.layout.is_cell
         pairs = zip(self.gradient[:, present], self.confidence_lost[:, present], strict=True)
         return np.array(
             [spearmanr(a, b).statistic if np.ptp(a) and np.ptp(b) else np.nan for a, b in pairs]
@@ -124,7 +124,7 @@ class Sensitivity:
         for value, lost, rho in zip(
             self.values, self.accuracy_lost, self.rank_correlation, strict=True
         ):
-            present = lost[self.layout.present.ravel()]
+            present = lost[self.layout.is_cell]
             lines.append(
                 f"one cell at {value:g}: accuracy {-present.mean():+.3f} on average,"
                 f" {-present.max():+.3f} at worst; gradient estimate: rank correlation {rho:.2f}"
@@ -135,19 +135,16 @@ class Sensitivity:
 
     def plot(self) -> Any:
         """Draw the accuracy lost on a map of each pad and value; return the matplotlib figure."""
-        from diagnostics.decision.plot import draw_forces, pads_figure
+        from diagnostics.decision.plot import draw_row, pads_figure
 
         figure, axes = pads_figure(self.layout, n_rows=len(self.values))
-        shown = np.where(self.layout.present.ravel(), self.accuracy_lost, np.nan)
+        shown = np.where(self.layout.is_cell, self.accuracy_lost, np.nan)
         for value, losses, row in zip(self.values, shown, axes, strict=True):
             # each value on its own scale: a short costs far more
             top = max(float(np.nanmax(losses)), 1 / self.n)
-            for pad, ax in enumerate(row):
-                image = draw_forces(
-                    ax, self.layout.grid(losses)[pad], self.layout, vmin=0, vmax=top, cmap="Reds"
-                )
-                ax.set_title(f"stuck at {value:g}, pad {pad}", fontsize=9)
-            figure.colorbar(image, ax=row.tolist(), label="accuracy lost")
+            title = f"stuck at {value:g}, "
+            label = "accuracy lost"
+            draw_row(row, losses, self.layout, title, top=top, cmap="Reds", label=label)
         for rank, (cell, value, lost) in enumerate(self.worst(), start=1):
             pad, at, col = self.layout.position(cell)
             if lost > 0:
@@ -273,7 +270,7 @@ def _enumerate(
     n_cells = windows.x.shape[2]
     answer, n_classes = _answers(model, windows)
     layout = getattr(model, "layout", None)
-    present = layout.present.ravel() if isinstance(layout, SensorLayout) else np.ones(n_cells, bool)
+    present = layout.is_cell if isinstance(layout, SensorLayout) else np.ones(n_cells, bool)
     usual = _Tally(1, 1, n_classes)
     stuck = _Tally(len(levels), n_cells, n_classes)
     hide = None if progress is None else not progress

@@ -49,7 +49,7 @@ def random_fault_set(layout: SensorLayout, rng: np.random.Generator) -> FaultSet
             lost[which, top:bottom, left:right] = True
         case "pad":
             lost[rng.integers(pads)] = True
-    cells = np.flatnonzero(lost.ravel() & layout.present.ravel())
+    cells = np.flatnonzero(lost.ravel() & layout.is_cell)
     if len(cells) == layout.present.sum():
         cells = rng.permutation(cells)[1:]
     return FaultSet(tuple(cells.tolist()), layout.n_cells)

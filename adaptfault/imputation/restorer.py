@@ -162,7 +162,7 @@ class Restorer:
         key = mask.tobytes()
         plan = self._plans.get(key)
         if plan is None:
-            fault_set = FaultSet(tuple(np.flatnonzero(mask).tolist()), len(mask))
+            fault_set = FaultSet.of(mask, len(mask))
             plan = (
                 self._tile_maps(fault_set) if self._tiled is not None else (self._map(fault_set),)
             )

@@ -100,9 +100,7 @@ class CellImputer(OneToOneFeatureMixin, TransformerMixin, BaseEstimator):  # typ
         if key not in self._maps:
             if len(self._maps) >= 64:
                 self._maps.clear()
-            self._maps[key] = self._model.affine(
-                FaultSet(tuple(np.flatnonzero(mask).tolist()), len(mask))
-            )
+            self._maps[key] = self._model.affine(FaultSet.of(mask, len(mask)))
         return self._maps[key]
 
     def __sklearn_tags__(self) -> Any:
@@ -203,8 +201,7 @@ class _FaultTolerant(MetaEstimatorMixin, BaseEstimator):  # type: ignore[misc]
     def predict(self, X: ArrayLike) -> NDArray[Any]:
         """Return predictions ``[n]`` for samples ``[n, D]``; the columns of F may hold anything,
         NaN included."""
-        x = self._input(X)
-        return np.asarray(self.estimator_.predict(x))
+        return np.asarray(self.estimator_.predict(self._input(X)))
 
     def _input(self, X: ArrayLike) -> NDArray[np.float64]:
         check_is_fitted(self)
@@ -270,14 +267,12 @@ class FaultTolerantClassifier(ClassifierMixin, _FaultTolerant):  # type: ignore[
     @available_if(_estimator_has("predict_proba"))  # type: ignore[untyped-decorator, unused-ignore]
     def predict_proba(self, X: ArrayLike) -> NDArray[np.float64]:
         """Return class probabilities ``[n, n_classes]``."""
-        x = self._input(X)
-        return np.asarray(self.estimator_.predict_proba(x))
+        return np.asarray(self.estimator_.predict_proba(self._input(X)))
 
     @available_if(_estimator_has("decision_function"))  # type: ignore[untyped-decorator, unused-ignore]
     def decision_function(self, X: ArrayLike) -> NDArray[np.float64]:
         """Return the decision function ``[n]`` or ``[n, n_classes]``."""
-        x = self._input(X)
-        return np.asarray(self.estimator_.decision_function(x))
+        return np.asarray(self.estimator_.decision_function(self._input(X)))
 
 
 class FaultTolerantRegressor(RegressorMixin, _FaultTolerant):  # type: ignore[misc]

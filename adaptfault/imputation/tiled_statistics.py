@@ -107,9 +107,7 @@ class TiledStatistics:
         power = np.zeros((size[0], size[1] // 2 + 1))
         which = evenly(len(self.frames), _POOLED_FRAMES)
         for index in which:
-            pads = np.where(layout.present.ravel(), self.frames[index] - self.rest, 0).reshape(
-                layout.shape
-            )
+            pads = np.where(layout.is_cell, self.frames[index] - self.rest, 0).reshape(layout.shape)
             power += (np.abs(np.fft.rfft2(pads, s=size)) ** 2).sum(axis=0)
         covariance = np.fft.irfft2(power, s=size) / (len(which) * max(1, int(layout.present.sum())))
         offsets = np.arange(1 - _REACH, _REACH)

@@ -79,7 +79,7 @@ class Begins:
             names: of all.
             layout: the array.
         """
-        present = layout.present.ravel()
+        present = layout.is_cell
         origin = np.nan_to_num(known_quantile(self.starts[:, present], 0.5, axis=0))
         begins = np.nan_to_num(self.starts[:, present] - origin).mean(axis=1)
         loads = self.means - origin.mean()
@@ -112,7 +112,7 @@ class Begun:
     """How one recording begins, while its frames come; ``layout``: the array."""
 
     def __init__(self, layout: SensorLayout) -> None:
-        self._present = layout.present.ravel()
+        self._present = layout.is_cell
         self._first = np.zeros((0, layout.n_cells))
         self._start = np.full(layout.n_cells, np.nan)
         self._lowest = np.full(layout.n_cells, np.nan)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from adaptfault.data.recordings import Opened, Recordings
 from adaptfault.data.recordings.facts.rates import Clock
-from adaptfault.data.recordings.load import PART
+from adaptfault.data.recordings.opened import PART
 from adaptfault.data.summary import summary_of
 from adaptfault.inspection.begins import Begins
 from adaptfault.inspection.code import Need

@@ -172,7 +172,7 @@ class DataSetCheck:
         return "; ".join(places)
 
     def _missing_share(self) -> float:
-        present = self.summary.layout.present.ravel()
+        present = self.summary.layout.is_cell
         readings = int(self.summary.lengths.sum()) * int(present.sum())
         return float(self.summary.missing[present].sum()) / max(readings, 1)
 

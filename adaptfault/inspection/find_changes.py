@@ -94,7 +94,7 @@ def _as_own_reference(
     others do not tell it: it is its own reference. None where most of these are faulty then, too,
     or the log is of the same sensor."""
     layout = diagnoser.layout
-    explained = _explained(as_found.diagnosis)[layout.present.ravel()]
+    explained = _explained(as_found.diagnosis)[layout.is_cell]
     if not as_found.diagnosis.fault_set or explained.mean() <= MAJORITY / 2:
         return None
     another = _another(diagnoser, as_found, healthy, with_faulty=True)
@@ -345,7 +345,7 @@ def _faulty(diagnosis: Diagnosis) -> NDArray[np.bool_]:
     for fault in diagnosis.faults:
         otherwise[list(fault.cells)] = fault.kind in (FaultKind.DRIFT, FaultKind.WEAK)
     for pad in range(layout.pads):
-        on = layout.present.ravel() & (layout.pad_of == pad)
+        on = layout.is_cell & (layout.pad_of == pad)
         if (on & otherwise).sum() > LEAST_LOADED * on.sum():
             faulty[on & otherwise] = False
     return faulty

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal, overload
+from typing import Any, overload
 
 from adaptfault.inspection.code import LEVELS, NEEDS, PREFIX, Code, Need
 from adaptfault.inspection.code_list import CODES
@@ -20,8 +20,6 @@ from adaptfault.inspection.severity import worst
 from diagnostics import SensorLayout
 from diagnostics.decision.numbering import Numbering
 from diagnostics.shown import shown
-
-Format = Literal["text", "github", "markdown", "json"]
 
 _NEVER = "never"
 _FROM = {level: LEVELS.index(level) for level in LEVELS}  # the least severity of each level

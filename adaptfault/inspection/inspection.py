@@ -64,7 +64,8 @@ def inspect(
     disturbances = _disturbances(given, log, healthy, layout)
     if any(one.name == "silent_array" for one in disturbances):
         findings = [_finding(one) for one in disturbances]
-        return Inspection(ChangedReadings(None, None, log, _untold(log, layout)), tuple(findings))
+        untold = Diagnosis.untold(layout, list(map(len, log)))
+        return Inspection(ChangedReadings(None, None, log, untold), tuple(findings))
     crosstalk = shared.crosstalk is not None
     if diagnoser.reference_ is None:
         fitted = diagnoser.for_log(log, classes=classes, progress=progress)
@@ -154,7 +155,7 @@ def _disturbances(
     converter's range."""
     sentinel = find_sentinel(given, layout)
     found = [] if sentinel is None else [sentinel]
-    if any(np.isfinite(frames[:, layout.present.ravel()]).any() for frames in log):
+    if any(np.isfinite(frames[:, layout.is_cell]).any() for frames in log):
         return found + find_disturbances(log, healthy, layout)
     return [
         *found,
@@ -169,7 +170,7 @@ def _without_groups(
     where no other cell is left."""
     cells = [cell for fault in diagnosis.faults if fault.line is not None for cell in fault.cells]
     faulty = FaultSet(tuple(cells), diagnosis.layout.n_cells).mask
-    left = diagnosis.layout.present.ravel() & ~faulty
+    left = diagnosis.layout.is_cell & ~faulty
     if not cells or not left.any():
         return None
     return [np.where(faulty, np.nan, frames) for frames in log]
@@ -228,15 +229,3 @@ def _of_change(change: SensorChange | None) -> list[Finding]:
 
 def _finding(disturbance: Disturbance) -> Finding:
     return finding_of(disturbance.name, disturbance.reason)
-
-
-def _untold(log: list[NDArray[np.float64]], layout: SensorLayout) -> Diagnosis:
-    """Return a diagnosis that judges no cell."""
-    return Diagnosis(
-        layout=layout,
-        faults=(),
-        probability=np.zeros(layout.n_cells),
-        tested=np.zeros(layout.n_cells, bool),
-        n_frames=sum(map(len, log)),
-        n_recordings=len(log),
-    )

@@ -49,7 +49,7 @@ class Work:
         found = hashlib.sha256(f"{SCHEMA} {self.parts}".encode())
         stated = {name: str(value) for name, value in self.options.items()}
         found.update(json.dumps(stated, sort_keys=True).encode())
-        for place in local_paths(self.paths, self.options):
+        for place in local_paths(self.paths, self.options, []):
             for file in sorted(place.rglob("*")) if place.is_dir() else [place]:
                 if file.is_file():
                     about = file.stat()

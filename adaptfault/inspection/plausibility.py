@@ -19,7 +19,7 @@ _RIDGE = 1e-6  # of the mean variance: covariances are stored in single precisio
 
 def implausible(recording: NDArray[Any], layout: SensorLayout) -> str | None:
     """Return why a recording ``[T, D]`` cannot be from this sensor; None if it can."""
-    frames = recording[:, layout.present.ravel()]
+    frames = recording[:, layout.is_cell]
     present = ~np.isnan(frames)
     if not present.any():
         return "it holds no reading"
@@ -50,9 +50,7 @@ def contradiction(
     exceed its variance by construction. 0 where that excludes all of them (idle or static).
     """
     healthy = np.array(
-        sorted(
-            set(fault_set.healthy.tolist()) & set(np.flatnonzero(layout.present.ravel()).tolist())
-        )
+        sorted(set(fault_set.healthy.tolist()) & set(np.flatnonzero(layout.is_cell).tolist()))
     )
     covariance = statistics.covariance[np.ix_(healthy, healthy)]
     covariance = covariance + (

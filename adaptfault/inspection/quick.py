@@ -63,7 +63,7 @@ class Quick:
         """What was not checked, with what would check it."""
         diagnosis = self.inspection.diagnosis
         layout = diagnosis.layout
-        left = layout.present.ravel() & ~diagnosis.fault_set.mask
+        left = layout.is_cell & ~diagnosis.fault_set.mask
         found = [
             Unchecked(
                 f"{int((left & self.answers).sum())} cells answer together with those beside them;"
@@ -105,18 +105,10 @@ def quick(statistics: Statistics) -> Quick:
     if load is not None:
         held = replace(held, value=load.readings(held.value, np.zeros(len(place), bool)))
     held = held.of(place)
-    diagnosis = Diagnosis(
-        layout=layout,
-        faults=(),
-        probability=np.zeros(layout.n_cells),
-        tested=np.zeros(layout.n_cells, bool),
-        n_frames=sum(lengths),
-        n_recordings=len(lengths),
-        transport=_transport(statistics),
-    )
+    diagnosis = Diagnosis.untold(layout, lengths, transport=_transport(statistics))
     diagnosis = with_recordings(diagnosis, held, lengths, tolerance, None)
     together = statistics.together.of_cells(order)
-    present = layout.present.ravel()
+    present = layout.is_cell
     answers = together.answers(spans)[place] & present
     moves = np.asarray(together.moves(spans).any(axis=0))[place] & present
     findings = faults_and_frames(diagnosis)

@@ -79,7 +79,7 @@ class Statistics:
         """Return the statistics of a data set, read once."""
         layout = log.layout
         naming = Naming.of(log)
-        present = layout.present.ravel()
+        present = layout.is_cell
         spans = []
         together = []
         pieces = []

@@ -84,7 +84,7 @@ class Longest:
     """The longest run of one recording, while its frames come; ``layout``: the array."""
 
     def __init__(self, layout: SensorLayout) -> None:
-        self._present = layout.present.ravel()
+        self._present = layout.is_cell
         self._above = _LOADED * layout.full_scale
         self._lowest = np.full(int(self._present.sum()), np.nan)
         self._last: NDArray[Any] | None = None

@@ -46,7 +46,7 @@ def write_table(
     pa = imported("pyarrow", path)
     parquet = imported("pyarrow.parquet", path)
     layout = diagnosis.layout
-    cells = np.flatnonzero(layout.present.ravel())
+    cells = np.flatnonzero(layout.is_cell)
     places = np.array([layout.position(cell) for cell in cells.tolist()]).reshape(len(cells), -1)
     names = [pads[pad] if pads else str(pad) for pad in places[:, 0].tolist()]
     verdicts = [str(one) for one in Verdict]

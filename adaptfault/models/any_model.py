@@ -97,44 +97,18 @@ class AnyModel(WindowModel):
             ValueError: the forward pass fails, its output is not ``[N, n]`` or ``[N, ...]``, a
                 policy does not see touch, or the named features cannot be found.
         """
-        shape = list(x[:_PROBE].shape)
-        wrapped = cls(module, layout, shape[1], 1, touch=touch)
-        name = type(module).__name__
+        wrapped = cls(module, layout, x.shape[1], 1, touch=touch)
         device = device_of(module)
         x = x[:_PROBE].to(device)
         others = {key: values[:_PROBE].to(device) for key, values in extra.items()}
-        linear: dict[nn.Module, str] = {
-            of: at for at, of in module.named_modules() if isinstance(of, nn.Linear)
-        }
-        used: list[tuple[nn.Module, Tensor]] = []
-        hooks = [
-            of.register_forward_hook(lambda of, _, out: used.append((of, out))) for of in linear
-        ]
+        linear = {of: at for at, of in module.named_modules() if isinstance(of, nn.Linear)}
+        used: list[Any] = []
+        hooks = [of.register_forward_hook(lambda of, *_: used.append(of)) for of in linear]
         try:
-            with evaluating(module):
-                outputs: Any = wrapped.call(x, others)
-        except Exception as error:  # a model may raise anything
-            raise ValueError(
-                f"{name} fails on windows of shape {shape}{_and(others)}: {first_line(error)}; an"
-                " adapter needs a module from [N, T, D] to [N, n], so wrap one that takes another"
-                " shape"
-            ) from None
+            outputs = wrapped._outputs(x, others, actions)
         finally:
             for hook in hooks:
                 hook.remove()
-        fits = isinstance(outputs, Tensor) and len(outputs) == len(x)
-        if not fits or outputs.dim() < 2 or (outputs.dim() > 2 and not actions):
-            given = list(outputs.shape) if isinstance(outputs, Tensor) else type(outputs).__name__
-            expected = "..." if actions else "n"
-            raise ValueError(
-                f"{name} returns {given} for windows of shape {shape}: expected"
-                f" [{len(x)}, {expected}]"
-            )
-        if not torch.isfinite(outputs).all():
-            raise ValueError(
-                f"{name} returns NaN or infinity for finite windows: give a model with finite"
-                " weights"
-            )
         wrapped.shape = tuple(outputs.shape[1:])
         wrapped.n_classes = math.prod(wrapped.shape)
         if others or len(wrapped.shape) > 1:
@@ -144,17 +118,47 @@ class AnyModel(WindowModel):
         elif features is not None:
             wrapped.function = features
         elif used:
-            wrapped.layer = linear[used[-1][0]]
+            wrapped.layer = linear[used[-1]]
             wrapped.last_linear = True
         wrapped._check_features(x, others, features)
         return wrapped
+
+    @property
+    def _name(self) -> str:
+        return type(self.module).__name__
+
+    def _outputs(self, x: Tensor, extra: Mapping[str, Tensor], actions: bool) -> Tensor:
+        """Run the module once, and refuse outputs that are none."""
+        shape = list(x.shape)
+        try:
+            with evaluating(self.module):
+                outputs = self.call(x, extra)
+        except Exception as error:  # a model may raise anything
+            raise ValueError(
+                f"{self._name} fails on windows of shape {shape}{_and(extra)}:"
+                f" {first_line(error)}; an adapter needs a module from [N, T, D] to [N, n], so wrap"
+                " one that takes another shape"
+            ) from None
+        fits = isinstance(outputs, Tensor) and len(outputs) == len(x)
+        if not fits or outputs.dim() < 2 or (outputs.dim() > 2 and not actions):
+            expected = "..." if actions else "n"
+            raise ValueError(
+                f"{self._name} returns {_shape(outputs)} for windows of shape {shape}: expected"
+                f" [{len(x)}, {expected}]"
+            )
+        if not torch.isfinite(outputs).all():
+            raise ValueError(
+                f"{self._name} returns NaN or infinity for finite windows: give a model with finite"
+                " weights"
+            )
+        return outputs
 
     def _check_touch(self, x: Tensor, extra: Mapping[str, Tensor], outputs: Tensor) -> None:
         """Refuse a policy whose actions are the same whatever the cells read."""
         with evaluating(self.module):
             if torch.equal(self.call(1.0 - x, extra), outputs):
                 raise ValueError(
-                    f"{type(self.module).__name__} does not use touch: its actions stay the same"
+                    f"{self._name} does not use touch: its actions stay the same"
                     " whatever the cells read, so there is nothing to repair"
                 )
 
@@ -165,30 +169,21 @@ class AnyModel(WindowModel):
         unusable."""
         if self.layer is None and self.function is None:
             return
-        name = type(self.module).__name__
         try:
             with evaluating(self):
                 found: Any = self.features(x, **extra)
-            shape = list(found.shape) if isinstance(found, Tensor) else type(found).__name__
-            problem = (
-                None
-                if isinstance(found, Tensor) and found.dim() == 2 and len(found) == len(x)
-                else shape
-            )
+            if isinstance(found, Tensor) and found.dim() == 2 and len(found) == len(x):
+                return
+            problem = _shape(found)
         except Exception as error:
             problem = first_line(error)
-        if problem is None:
-            return
         if given is not None:
             layers = [at for at, _ in self.module.named_modules() if at]
-            given = (
-                given
-                if isinstance(given, str)
-                else getattr(given, "__name__", type(given).__name__)
-            )
+            if not isinstance(given, str):
+                given = getattr(given, "__name__", type(given).__name__)
             raise ValueError(
-                f"the features {given!r} of {name} are not [{len(x)}, p] for {len(x)} windows:"
-                f" {problem}; name one of its layers"
+                f"the features {given!r} of {self._name} are not [{len(x)}, p] for {len(x)}"
+                f" windows: {problem}; name one of its layers"
                 f" ({', '.join(layers[:8])}{', ...' if len(layers) > 8 else ''})"
             )
         self.layer = None
@@ -225,9 +220,7 @@ class AnyModel(WindowModel):
         if self.function is not None:
             return self.function(self.module, x, **extra)
         if self.layer is None:
-            raise ValueError(
-                f"{type(self.module).__name__} has no features: name a layer with features="
-            )
+            raise ValueError(f"{self._name} has no features: name a layer with features=")
         seen: list[Any] = []
         layer = self.module.get_submodule(self.layer)
         if self.last_linear:
@@ -308,7 +301,7 @@ class AnyModel(WindowModel):
         """
         if kinds := not_resettable(self.module):
             raise ValueError(
-                f"{type(self.module).__name__} cannot be trained anew: {', '.join(kinds)} has"
+                f"{self._name} cannot be trained anew: {', '.join(kinds)} has"
                 " parameters but no reset_parameters()"
             )
         copied = copy.deepcopy(self)
@@ -348,6 +341,11 @@ def _and(extra: Mapping[str, Tensor]) -> str:
     """Return what a module sees beside touch, for a message."""
     shapes = (f"{name} {list(values.shape)}" for name, values in extra.items())
     return "".join(f", {shape}" for shape in shapes)
+
+
+def _shape(found: Any) -> str:
+    """Return the shape of a tensor, or the type of what is none, for a message."""
+    return str(list(found.shape)) if isinstance(found, Tensor) else type(found).__name__
 
 
 def device_of(module: nn.Module) -> torch.device:

@@ -182,9 +182,7 @@ class TactileTransformer(WindowModel):
         self.seed = seed
         self.register_buffer("mean", torch.zeros(layout.n_cells))
         self.register_buffer("unit", torch.tensor(0.0 if inputs == "standardised" else 1.0))
-        self.register_buffer(
-            "present", torch.from_numpy(layout.present.ravel().copy()), persistent=False
-        )
+        self.register_buffer("present", torch.from_numpy(layout.is_cell.copy()), persistent=False)
         d = FILTERS[-1] * (layout.rows - lost) * (layout.shape[2] - lost)
         with torch.random.fork_rng(devices=[]):
             torch.default_generator.manual_seed(seed)
@@ -205,8 +203,8 @@ class TactileTransformer(WindowModel):
         if self.unit > 0:
             return
         readings = np.asarray(x, dtype=np.float64)
-        mean = np.where(self.layout.present.ravel(), readings.mean(axis=(0, 1)), 0.0)
-        spread = (readings - mean)[..., self.layout.present.ravel()].std()
+        mean = np.where(self.layout.is_cell, readings.mean(axis=(0, 1)), 0.0)
+        spread = (readings - mean)[..., self.layout.is_cell].std()
         self.mean.copy_(torch.from_numpy(mean))
         self.unit.fill_(float(spread) or 1.0)
 

@@ -6,44 +6,32 @@ from __future__ import annotations
 import copy
 import logging
 import os
-import threading
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from time import monotonic
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from adaptfault.bundle.bundle import PROCESS
-from adaptfault.bundle.checksummed_json import Damaged, decoding
+from adaptfault.bundle.checksummed_json import Damaged
 from adaptfault.bundle.pointer import file_stamp
+from adaptfault.bundle.reload import Reload
 from adaptfault.data.windows import finite_windows, scale
 from adaptfault.inspection.converter_range import within_range
 from adaptfault.models.accumulation import ContactDecision
-from adaptfault.prediction.inference import Inference
+from adaptfault.prediction.loaded import Loader, start_any
 from adaptfault.prediction.reading import Reading
-from diagnostics import Diagnosis, Fault, FaultSet, Monitor, Scan, SelfDiagnosis, SensorLayout
+from diagnostics import Diagnosis, Fault, FaultSet, Monitor, Scan, SelfDiagnosis
 
 if TYPE_CHECKING:
     from adaptfault.bundle.bundle import Bundle
     from adaptfault.bundle.versions import Version
 
 _POLL = 1.0  # seconds between two checks of the bundle's pointer
-_RETRY = 60.0  # seconds until the next check after the bundle could not be read
-_STARTS = 3  # attempts to load a version; the bundle falls back to an earlier one after two
 
 _log = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True, eq=False)
-class _Running:
-    """A loaded version, and the bundle that was opened for it."""
-
-    version: Version
-    model: Inference
-    bundle: Bundle
 
 
 class Predictor:
@@ -76,19 +64,13 @@ class Predictor:
         sets: float | None = None,
         wait: bool = False,
     ) -> None:
-        self._open = open_bundle
         self._wait = wait
         self._sets = sets
         self._accumulate = accumulate
+        self._loader = Loader(open_bundle)
         bundle = open_bundle()
-        self._pointer = bundle.pointer
-        self._stamp = file_stamp(self._pointer)
-        self._running = _start_any(bundle)
-        self._next_look = monotonic() + _POLL
-        self._loading: threading.Thread | None = None
-        self._ready: _Running | None = None
-        self._failed: int | None = None  # number of the version that could not be loaded
-        self._told: set[str] = set()  # problems that were logged
+        self._reload = Reload(self._loader, partial(file_stamp, bundle.pointer), _POLL)
+        self._running = start_any(bundle)
         self._diagnoser = _reference(bundle)
         self._monitor = Monitor(self._diagnoser, wait=self._wait)
         self.layout = bundle.layout
@@ -142,10 +124,9 @@ class Predictor:
         """Return a predictor of the running version for another device; nothing is read for it."""
         other = copy.copy(self)
         other._monitor = Monitor(self._diagnoser, wait=self._wait)
-        other._loading = other._ready = None
-        if self._loading is not None:
-            other._stamp = None  # it looks by itself for the version that is being loaded
-        other._told = set()
+        other._loader = copy.copy(self._loader)
+        other._loader.told = set()
+        other._reload = self._reload.sibling(other._loader)
         other.outside = 0
         other._decision = other._new_decision()
         other.reset()
@@ -287,7 +268,7 @@ class Predictor:
         if not self._accumulate:
             return None
         model = self._running.model
-        healthy = self.layout.present.ravel() & ~model.fault_set.mask
+        healthy = self.layout.is_cell & ~model.fault_set.mask
         return ContactDecision(model.contact, healthy, model.length)
 
     def reset(self) -> None:
@@ -310,7 +291,7 @@ class Predictor:
                 return False
             bundle.confirm()
         except (OSError, Damaged) as error:
-            self._tell(f"version {self.version} stays on probation: {error}")
+            self._loader.tell(f"version {self.version} stays on probation: {error}")
             return False
         return True
 
@@ -325,109 +306,17 @@ class Predictor:
 
     def _keep_up(self) -> None:
         """Switch to a new version once it is loaded; check for one every second."""
-        if self._loading is not None:
-            if self._loading.is_alive():
-                return
-            self._loading = None
-            if self._ready is not None:
-                before = self._running
-                self._running = self._ready
-                self._ready = None
-                # the frames so far read otherwise
-                if before.version.readings != self._running.version.readings:
-                    self._diagnoser = _reference(self._running.bundle)
-                    self._monitor = Monitor(self._diagnoser, wait=self._wait)
-                    self.reset()
-                self._decision = self._new_decision()
-                _log.info("version %d runs now", self.version)
-        now = monotonic()
-        if now < self._next_look:
+        before = self._running
+        self._running = self._reload.poll(before) or before
+        if self._running is before:
             return
-        self._next_look = now + _POLL
-        stamp = file_stamp(self._pointer)
-        if stamp is not None and stamp != self._stamp:
-            self._stamp = stamp
-            self._loading = threading.Thread(
-                target=self._load_new, name="adaptfault-load", daemon=True
-            )
-            self._loading.start()
-
-    def _load_new(self) -> None:
-        """Load the active version if it differs from the running one; runs in a thread and never
-        raises.
-
-        After an error of the system, as too many open files, it is tried again. A version that is
-        damaged is not.
-        """
-        number = None
-        try:
-            bundle = self._open()
-            if bundle.active().number in (self.version, self._failed):
-                return
-            version = bundle.begin()
-            number = version.number
-            if number != self.version:
-                self._ready = _start(bundle, version, self.layout)
-        except Exception as error:  # a failed load must not stop the robot's loop
-            if number is None or _passes(error):
-                self._stamp = None
-                self._next_look = monotonic() + _RETRY
-            else:
-                self._failed = number
-            what = (
-                "the bundle could not be read"
-                if number is None
-                else f"version {number} could not be loaded"
-            )
-            self._tell(f"{what}, version {self.version} goes on: {error}")
-
-    def _tell(self, text: str) -> None:
-        """Log a problem once, however often it comes again."""
-        if text not in self._told:
-            _log.warning("%s", text)
-        self._told.add(text)
-
-
-def _start(bundle: Bundle, version: Version, layout: SensorLayout) -> _Running:
-    """Load a version and run it once, so that errors and the first run's set-up time come before
-    the first frame.
-
-    Raises:
-        FileNotFoundError, ImportError, ValueError: the version cannot be loaded.
-    """
-    with decoding(version.folder):
-        model = Inference.load(version.files)
-    if model.layout != layout:
-        raise ValueError(f"the version is for {model.layout}, the bundle for {layout}")
-    model.predict(np.zeros((1, model.length, layout.n_cells), np.float32))
-    _ = version.readings  # raises Damaged
-    return _Running(version, model, bundle)
-
-
-def _start_any(bundle: Bundle) -> _Running:
-    """Start the active version; repeat on failure, until the bundle falls back to an earlier
-    version.
-
-    An attempt that fails by an error of the system, as too many open files, does not count against
-    the version.
-    """
-    failures = 0
-    for left in reversed(range(_STARTS)):
-        version = bundle.begin(f"{PROCESS}, {failures} failures")
-        try:
-            return _start(bundle, version, bundle.layout)
-        except (OSError, MemoryError, ImportError, ValueError) as error:
-            if not left:
-                raise
-            failures += not _passes(error)
-            _log.warning("version %d could not be loaded: %s", version.number, error)
-    raise AssertionError("unreachable")
-
-
-def _passes(error: Exception) -> bool:
-    """Return whether the same call may succeed later: the system had too little of something, the
-    files are whole."""
-    return isinstance(error, OSError | MemoryError) and not isinstance(error, FileNotFoundError)
+        # the frames so far read otherwise
+        if before.version.readings != self._running.version.readings:
+            self._diagnoser = _reference(self._running.bundle)
+            self._monitor = Monitor(self._diagnoser, wait=self._wait)
+            self.reset()
+        self._decision = self._new_decision()
+        _log.info("version %d runs now", self.version)
 
 
 def _reference(bundle: Bundle) -> SelfDiagnosis:

@@ -61,7 +61,7 @@ class Masked(nn.Module):
         faults = model.fault_set
         d = layout.n_cells
         missing = np.flatnonzero(faults.mask)
-        present = layout.present.ravel()
+        present = layout.is_cell
         weight = torch.zeros(d, d)
         bias = torch.zeros(d)
         if isinstance(model.front, AffineFill):

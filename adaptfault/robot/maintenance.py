@@ -14,8 +14,8 @@ from os import PathLike
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from adaptfault.bundle.bundle import Bundle, now
-from adaptfault.bundle.journal import Entry
+from adaptfault.bundle.bundle import Bundle
+from adaptfault.bundle.journal import Entry, now
 from adaptfault.bundle.known_faults import KnownFaults
 from adaptfault.bundle.signature import read_private_key
 from adaptfault.bundle.signing import sign_bundle

@@ -110,7 +110,7 @@ def cells_by_pad(
 ) -> tuple[PadCells, ...]:
     """Return the cells of each pad by state: those of known faults, and what a diagnosis tells of
     the others."""
-    faulty = FaultSet(tuple({c for fault in faults for c in fault.cells}), layout.n_cells)
+    faulty = FaultSet.of([c for fault in faults for c in fault.cells], layout.n_cells)
     present = layout.present.reshape(layout.pads, -1)
     bad = faulty.mask.reshape(layout.pads, -1) & present
     if diagnosis is None:

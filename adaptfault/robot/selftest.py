@@ -133,7 +133,7 @@ def loads(frames: Sequence[Floats], layout: SensorLayout) -> NDArray[np.bool_]:
     """
     every = np.concatenate(frames)
     known = np.where(np.isfinite(every), every, np.nan)
-    present = layout.present.ravel() & ~np.isnan(known).all(axis=0)
+    present = layout.is_cell & ~np.isnan(known).all(axis=0)
     rest = np.zeros(layout.n_cells)
     least = np.nanquantile(known[:, present], (LOW, 0.5, 1 - LOW), axis=0)
     falls = np.nanmean(known[:, present] - least[1]) < 0  # load lowers the readings
@@ -150,7 +150,7 @@ def cell_weights(adapter: Adapter, faulty: FaultSet | None = None) -> Floats:
     """Return what each cell matters, ``[D]``, of sum 1: the accuracy that is lost if it reads 0 and
     is not in F."""
     windows = adapter.validation
-    present = adapter.layout.present.ravel().copy()
+    present = adapter.layout.is_cell.copy()
     if faulty is not None:
         present &= ~faulty.mask
     lost = np.zeros(adapter.layout.n_cells)

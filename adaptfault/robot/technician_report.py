@@ -59,10 +59,9 @@ def write_report(
     problems = bundle.problems(repair=False)
     if run is not None:
         state = _state_after(run, bundle, state)
-    used = [fault for fault in state.known.faults if fault in state.unhandled]
-    unhandled = by_group(used, bundle.layout)
-    recalls = [] if run is not None and run.dry_run else list(bundle.class_recalls())
-    recalls.sort(key=lambda one: one.low)
+    unhandled = by_group([f for f in state.known.faults if f in state.unhandled], bundle.layout)
+    dry_run = run is not None and run.dry_run
+    recalls = [] if dry_run else sorted(bundle.class_recalls(), key=lambda one: one.low)
     handled = [fault for fault in state.known.faults if fault not in state.unhandled]
     return render(
         path,
@@ -87,7 +86,7 @@ def write_report(
         diagnosis=diagnosis,
         numbering=Numbering.from_layout(bundle.layout, count_from),
         verdicts=diagnosis and Picture.of(partial(diagnosis.plot, count_from=count_from)),
-        dry_run=run is not None and run.dry_run,
+        dry_run=dry_run,
         runs=[_shown(one) for one in reversed(runs)],
         problems=problems,
         date=datetime.now().astimezone().strftime("%Y-%m-%d %H:%M %Z"),

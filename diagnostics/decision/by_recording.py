@@ -46,6 +46,22 @@ class _State:
     cells: Cells
 
 
+@dataclass(frozen=True)
+class _Faults:
+    """Faults, their cells (bool ``[D]``), and P(cell is faulty) ``[D]``."""
+
+    faults: list[Fault]
+    cells: NDArray[np.bool_]
+    probability: NDArray[np.float64]
+
+    def add(self, fault: Fault, least: float | NDArray[np.float64] = 0.0) -> None:
+        """Add a fault, whose cells have at ``least`` this probability."""
+        cells = list(fault.cells)
+        self.faults.append(fault)
+        self.cells[cells] = True
+        self.probability[cells] = np.maximum(self.probability[cells], least)
+
+
 def with_recordings(
     whole: Diagnosis,
     held: Held,
@@ -68,59 +84,56 @@ def with_recordings(
     # What an object holds, or its edge, is no held value of a cell.
     held = replace(held, suspect=held.suspect & ~whole.disturbed.mask)
     first = np.concatenate([[0], np.cumsum(lengths)]).tolist()
-    last = len(lengths) - 1
     # What comes and goes by recording is told better by the recordings in which it shows.
     partly = [fault for fault in whole.faults if _comes_and_goes(fault, held)]
-    faults = [_located(fault, held, first) for fault in whole.faults if fault not in partly]
-    found = {cell for fault in faults for cell in fault.cells}
-    probability = whole.probability.copy()
-    tested = whole.tested & ~held.suspect.any(axis=0)
+    told = _Faults([], np.zeros(len(whole.probability), bool), whole.probability.copy())
+    for fault in whole.faults:
+        if fault not in partly:
+            told.add(_located(fault, held, first))
     for state in _states(held)[:_PARTS]:
-        if diagnose is None or set(state.cells.tolist()) <= found:
+        if diagnose is None or told.cells[state.cells].all():
             continue
         part = diagnose(state.recordings)
         for fault in part.faults:
-            new = set(fault.cells) - found
-            if not new or (fault.line is None and len(new) < len(fault.cells)):
-                continue
-            shown = replace(fault, recordings=state.recordings, onset=first[state.recordings[0]])
-            faults.append(_told(shown, last))
-            found |= new
-            cells = list(fault.cells)
-            probability[cells] = np.maximum(probability[cells], part.probability[cells])
+            at = told.cells[list(fault.cells)]
+            if not at.all() and (fault.line is not None or not at.any()):
+                shown = _shown_in(state.recordings, fault, first)
+                told.add(shown, part.probability[list(fault.cells)])
     for fault in partly:
-        if not set(fault.cells) <= found:
-            faults.append(_located(fault, held, first))
-            found |= set(fault.cells)
-    certain = np.asarray(held.certain.any(axis=0))
-    certain[list(found)] = False
+        if not told.cells[list(fault.cells)].all():
+            told.add(_located(fault, held, first))
+    certain = held.certain.any(axis=0) & ~told.cells
     for fault in _held_faults(certain, held, whole.layout, tolerance):
         assert fault.recordings is not None
-        faults.append(_told(replace(fault, onset=first[fault.recordings[0]]), last))
-        found |= set(fault.cells)
-        cells = list(fault.cells)
-        probability[cells] = np.maximum(probability[cells], fault.probability or 0.0)
-    unproven = np.asarray(held.suspect.any(axis=0))
-    unproven[list(found)] = False
-    possible = [
-        _told(replace(fault, reason=f"perhaps {fault.reason}: press on it to tell"), last)
-        for fault in _held_faults(unproven, held, whole.layout, tolerance)
-    ]
-    again = held.again & ~unproven & ~whole.disturbed.mask
-    again[:, list(found)] = False
-    possible += _again_possible(again, whole.layout)
-    tested &= ~again.any(axis=0)
-    little = np.isfinite(held.share) & ~whole.tested & ~whole.disturbed.mask & ~again.any(axis=0)
-    little[list(found)] = False
-    little[unproven] = False
-    possible += _weak_possible(little, held.share, whole.layout)
-    tested[[cell for fault in faults for cell in fault.cells]] = True
+        told.add(_shown_in(fault.recordings, fault, first), fault.probability or 0.0)
+    return _with_states(whole, held, told, tolerance, first)
+
+
+def _with_states(
+    whole: Diagnosis, held: Held, told: _Faults, tolerance: float, first: Sequence[int]
+) -> Diagnosis:
+    """Return the diagnosis with these faults, with what is possible beside them, and with the
+    verdicts in each recording."""
+    last = len(first) - 2
+    suspect = held.suspect.any(axis=0)
+    again = held.again & ~(suspect | whole.disturbed.mask | told.cells)
+    doubted = suspect | again.any(axis=0)
+    little = np.isfinite(held.share) & ~(whole.tested | whole.disturbed.mask | doubted | told.cells)
+    unproven = _held_faults(suspect & ~told.cells, held, whole.layout, tolerance)
     result = replace(
         whole,
-        faults=tuple(faults),
-        probability=probability,
-        tested=tested,
-        possible=(*whole.possible, *possible),
+        faults=tuple(told.faults),
+        probability=told.probability,
+        tested=(whole.tested & ~doubted) | told.cells,
+        possible=(
+            *whole.possible,
+            *(
+                _told(replace(fault, reason=f"perhaps {fault.reason}: press on it to tell"), last)
+                for fault in unproven
+            ),
+            *_again_possible(again, whole.layout),
+            *_weak_possible(little, held.share, whole.layout),
+        ),
     )
     alive = held.moved & ~held.suspect & ~again & (whole.tested | result.fault_set.mask)
     return replace(result, states=_verdicts(result, alive, first))
@@ -153,12 +166,16 @@ def _located(fault: Fault, held: Held, first: Sequence[int]) -> Fault:
     of_cells = held.suspect[:, list(fault.cells)]
     each = of_cells.sum(axis=1) >= max(1, of_cells.any(axis=0).sum() / 2)
     recordings = np.flatnonzero(each)
-    last = len(each) - 1
-    lasts = len(recordings) == 0 or len(recordings) == last - recordings[0] + 1
+    lasts = len(recordings) == 0 or len(recordings) == len(each) - recordings[0]
     if lasts or fault.kind not in _COMES:
         return fault
-    shown = replace(fault, recordings=tuple(recordings.tolist()), onset=first[recordings[0]])
-    return _told(shown, last)
+    return _shown_in(tuple(recordings.tolist()), fault, first)
+
+
+def _shown_in(recordings: Recordings, fault: Fault, first: Sequence[int]) -> Fault:
+    """Return a fault that shows in some recordings."""
+    shown = replace(fault, recordings=recordings, onset=first[recordings[0]])
+    return _told(shown, len(first) - 2)
 
 
 def _told(fault: Fault, last: int) -> Fault:
@@ -180,7 +197,6 @@ def _held_faults(
     faults = []
     for line in layout.lines:
         cells = layout.cells_on(line)
-        cells = cells[layout.present.ravel()[cells]]
         one_set = len(cells) > 1 and left[cells].all()
         if one_set and (held.suspect[:, cells] == held.suspect[:, cells[:1]]).all():
             faults.append(_held_fault(cells, line, held, layout, tolerance))

@@ -68,7 +68,7 @@ def coverage(
         probability: float ``[D]``, P(faulty).
         layout: the array; positions without a cell do not count.
     """
-    present = layout.present.ravel()
+    present = layout.is_cell
     tested = 1.0 - float(untested[present].mean())
     expected = float(probability[present].sum())
     found = float(probability[present & faulty].sum())

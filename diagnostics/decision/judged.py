@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from diagnostics.decision.root_causes import CellFindings
+from diagnostics.decision.cell_findings import CellFindings
 from diagnostics.decision.static_load import StaticLoad
 from diagnostics.faults import Fault
 

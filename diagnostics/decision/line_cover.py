@@ -51,6 +51,8 @@ _WIRES = "row", "column", "converter", "position", "bus", "group"
 _IN_MIDDLE = "row", "column"  # wires that may be broken in their middle
 _FEW = 8  # wires up to which all sets are enumerated: a size
 
+Cells = NDArray[np.intp]
+Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 
@@ -79,17 +81,17 @@ class Cause:
 @dataclass(frozen=True)
 class _Candidate:
     line: Line
-    cells: NDArray[np.intp]  # behind the break
+    cells: Cells  # behind the break
     cost: float
     whole: bool
     on_line: int  # cells on the wire, on either side of the break
 
 
 def solve(
-    faulty: NDArray[np.bool_],
-    consistent: NDArray[np.bool_],
-    contradicting: NDArray[np.bool_],
-    weight: NDArray[np.float64],
+    faulty: Mask,
+    consistent: Mask,
+    contradicting: Mask,
+    weight: Floats,
     layout: SensorLayout,
     common: float = 0.0,
 ) -> tuple[Cause, ...]:
@@ -108,7 +110,7 @@ def solve(
     # Pads are independent of each other; a group may extend over several.
     part = layout.pad_of if layout.is_matrix else np.zeros(layout.n_cells, np.intp)
     for i in np.unique(part[consistent]).tolist():
-        on = layout.present.ravel() & (part == i)
+        on = layout.is_cell & (part == i)
         lines = [line for line in layout.lines if line.pad == i or not layout.is_matrix]
         causes += _explain(
             faulty & on, consistent & on, contradicting & on, weight, layout, lines, common
@@ -121,7 +123,7 @@ def _least_support(behind: int) -> int:
     return max(_MIN_OF_GROUP, min(_MIN_SUPPORT, -(-2 * behind // 3)))
 
 
-def _ends(line: Line, cells: NDArray[np.intp], contradicting: Mask) -> tuple[NDArray[np.intp], ...]:
+def _ends(line: Line, cells: Cells, contradicting: Mask) -> tuple[Cells, ...]:
     """Return the cells beyond the last working one, seen from either end of a wire; none if none
     works.
 
@@ -134,10 +136,10 @@ def _ends(line: Line, cells: NDArray[np.intp], contradicting: Mask) -> tuple[NDA
 
 
 def _explain(
-    faulty: NDArray[np.bool_],
-    consistent: NDArray[np.bool_],
-    contradicting: NDArray[np.bool_],
-    weight: NDArray[np.float64],
+    faulty: Mask,
+    consistent: Mask,
+    contradicting: Mask,
+    weight: Floats,
     layout: SensorLayout,
     lines: Sequence[Line],
     common: float,
@@ -176,40 +178,37 @@ def _explain(
         singles, before = int((~behind[found]).sum()), singles
         if singles == before:
             break
-    causes: list[Cause] = []
-    explained = np.zeros(layout.n_cells, bool)
 
-    def cause(c: _Candidate, gain: float, proven: bool) -> Cause:
+    def cause(c: _Candidate, faulty: Mask, proven: bool) -> Cause:
         cells = c.cells[~contradicting[c.cells]]
         seen = cells[supporting[cells]]
-        return Cause(
-            c.line, tuple(cells.tolist()), tuple(seen.tolist()), float(expit(gain)), c.whole, proven
-        )
+        broken = float(expit(_gain(c, faulty, support, cell_cost)))
+        return Cause(c.line, tuple(cells.tolist()), tuple(seen.tolist()), broken, c.whole, proven)
 
-    for c in chosen_wires:
-        causes.append(cause(c, _gain(c, faulty, support, cell_cost), True))
-        explained[list(causes[-1].cells)] = True
-    causes += [Cause(None, (cell,), (cell,), 1.0) for cell in found.tolist() if not explained[cell]]
+    causes = [cause(c, faulty, True) for c in chosen_wires]
+    explained = np.zeros(layout.n_cells, bool)
+    explained[[cell for one in causes for cell in one.cells]] = True
     left = faulty & ~explained
+    causes += [Cause(None, (cell,), (cell,), 1.0) for cell in np.flatnonzero(left).tolist()]
     support = np.where(explained, 0.0, support)
     more = _cheapest(candidates, np.flatnonzero(left), left, support, cell_cost, 0.0)
-    return causes + [cause(c, _gain(c, left, support, cell_cost), False) for c in more]
+    return causes + [cause(c, left, False) for c in more]
 
 
 def _candidates(
     line: Line,
-    cells: NDArray[np.intp],
-    contradicting: NDArray[np.bool_],
-    supporting: NDArray[np.bool_],
-    faulty: NDArray[np.bool_],
+    cells: Cells,
+    contradicting: Mask,
+    supporting: Mask,
+    faulty: Mask,
 ) -> list[_Candidate]:
     """Return the wire broken as a whole, and in its middle with either end working, where enough
     cells support it."""
 
-    def proven(behind: NDArray[np.intp]) -> bool:
+    def proven(behind: Cells) -> bool:
         return bool(supporting[behind].sum() >= _least_support(len(behind)))
 
-    def cost(behind: NDArray[np.intp]) -> float:
+    def cost(behind: Cells) -> float:
         return float(_LINE_COST + (0.0 if faulty[behind].any() else PROVEN))
 
     contradictions = int(contradicting[cells].sum())
@@ -229,7 +228,7 @@ def _candidates(
     return found
 
 
-def _discount(candidates: Sequence[_Candidate], uncertain: Mask) -> NDArray[np.float64]:
+def _discount(candidates: Sequence[_Candidate], uncertain: Mask) -> Floats:
     """Return the discount c of the evidence of each uncertain cell, ``[D]``: the inverse of Kish's
     design effect."""
     discount = np.ones(len(uncertain))
@@ -240,18 +239,16 @@ def _discount(candidates: Sequence[_Candidate], uncertain: Mask) -> NDArray[np.f
     return discount
 
 
-def _gain(
-    c: _Candidate, faulty: NDArray[np.bool_], support: NDArray[np.float64], cell_cost: float
-) -> float:
+def _gain(c: _Candidate, faulty: Mask, support: Floats, cell_cost: float) -> float:
     uncertain = c.cells[~faulty[c.cells]]
     return float(faulty[c.cells].sum()) * cell_cost + float(support[uncertain].sum()) - c.cost
 
 
 def _cheapest(
     candidates: Sequence[_Candidate],
-    found: NDArray[np.intp],
-    faulty: NDArray[np.bool_],
-    support: NDArray[np.float64],
+    found: Cells,
+    faulty: Mask,
+    support: Floats,
     cell_cost: float,
     least: float = PROVEN,
 ) -> list[_Candidate]:
@@ -273,9 +270,7 @@ def _cheapest(
     return [c for c in candidates if _gain(c, faulty, support, cell_cost) > least]
 
 
-def cheapest_of_few(
-    cost: NDArray[np.float64], covers: NDArray[np.bool_], saves: NDArray[np.float64]
-) -> Mask:
+def cheapest_of_few(cost: Floats, covers: Mask, saves: Floats) -> Mask:
     """Return the set of wires of least cost, bool ``[wires]``, by enumeration.
 
     Args:
@@ -290,9 +285,7 @@ def cheapest_of_few(
     return best
 
 
-def cheapest_of_many(
-    cost: NDArray[np.float64], covers: NDArray[np.bool_], saves: NDArray[np.float64]
-) -> Mask:
+def cheapest_of_many(cost: Floats, covers: Mask, saves: Floats) -> Mask:
     """Return the same set by integer programming: slower for few wires, feasible for many."""
     from scipy import sparse
     from scipy.optimize import Bounds, LinearConstraint, milp

@@ -50,7 +50,7 @@ def draw(
     from matplotlib.patches import Patch
 
     figure, ((*axes,),) = pads_figure(layout, n_rows=1, scale=False, page=page)
-    colours = np.where(layout.present.ravel(), verdicts.astype(np.intp), 3)
+    colours = np.where(layout.is_cell, verdicts.astype(np.intp), 3)
     palette = ListedColormap([_ALIVE, _FAULTY, _UNTESTED, _ABSENT])
     cell_points = 72 * _cell(layout, page)
     for pad, ax in enumerate(axes):
@@ -103,6 +103,39 @@ def draw_forces(
         ax.plot(col, row, "x", color="#e74c3c", markersize=6, markeredgewidth=1.6)
     _ticks(ax, layout)
     return image
+
+
+def draw_row(
+    axes: Sequence[Axes],
+    values: ArrayLike,
+    layout: SensorLayout,
+    title: str = "",
+    dead: Iterable[int] = (),
+    *,
+    top: float,
+    cmap: str = "viridis",
+    **bar: Any,
+) -> None:
+    """Draw values ``[D]`` as a heatmap of each pad with one colour bar, a cross on each of the
+    ``dead`` cells.
+
+    Args:
+        axes: one a pad.
+        values, layout: of the array.
+        title: before the name of the pad.
+        dead: cells.
+        top: value at the end of the scale, which begins at 0.
+        cmap: of the scale.
+        bar: of the colour bar.
+    """
+    size = layout.n_cells // layout.pads
+    shown = layout.grid(np.where(layout.is_cell, values, np.nan))
+    marked = list(dead)
+    for pad, ax in enumerate(axes):
+        on_pad = [int(cell) % size for cell in marked if cell // size == pad]
+        image = draw_forces(ax, shown[pad], layout, on_pad, vmin=0, vmax=top, cmap=cmap)
+        ax.set_title(f"{title}pad {pad}", fontsize=9)
+    axes[0].figure.colorbar(image, ax=list(axes), **bar)
 
 
 def pads_figure(

@@ -3,7 +3,7 @@ coverage."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from enum import IntEnum
 from functools import cached_property
@@ -115,12 +115,17 @@ class Diagnosis:
     states: NDArray[np.uint8] | None = None
     names: tuple[str, ...] = ()
 
+    @classmethod
+    def untold(cls, layout: SensorLayout, lengths: Sequence[int], **told: Any) -> Diagnosis:
+        """Return a diagnosis that judges no cell, of recordings of so many frames; ``told``: other
+        attributes."""
+        nothing = np.zeros(layout.n_cells)
+        return cls(layout, (), nothing, nothing > 0, sum(lengths), len(lengths), **told)
+
     @cached_property
     def fault_set(self) -> FaultSet:
         """F: the cells of all faults; an adapter must not use their readings."""
-        return FaultSet(
-            tuple({c for fault in self.faults for c in fault.cells}), self.layout.n_cells
-        )
+        return FaultSet.of([c for f in self.faults for c in f.cells], self.layout.n_cells)
 
     @cached_property
     def false_share(self) -> float:
@@ -152,18 +157,14 @@ class Diagnosis:
     def statically_loaded(self) -> FaultSet:
         """The cells of all static loads: healthy as far as the log tells, but their readings are
         not of contact."""
-        return FaultSet(
-            tuple({c for load in self.static_loads for c in load.cells}), self.layout.n_cells
-        )
+        return FaultSet.of([c for f in self.static_loads for c in f.cells], self.layout.n_cells)
 
     @property
     def disturbed(self) -> FaultSet:
         """The statically loaded cells and those beside them, which the edge of an object may
         load."""
-        beside = self.layout.beside[list(self.statically_loaded)].ravel()
-        return self.statically_loaded | FaultSet(
-            tuple(beside[beside >= 0].tolist()), self.layout.n_cells
-        )
+        loaded = self.statically_loaded
+        return FaultSet.of(self.layout.with_neighbours(loaded.mask), self.layout.n_cells)
 
     @property
     def n_lost(self) -> int:
@@ -179,15 +180,13 @@ class Diagnosis:
         both. On real grasps the two costs are equal at a probability of 0.02 for cells that read 0,
         and at 0.001 for full scale.
         """
-        likely = np.flatnonzero(
-            self.tested & (self.probability >= probability) & self.layout.present.ravel()
-        )
-        return self.fault_set | FaultSet(tuple(likely.tolist()), self.layout.n_cells)
+        likely = self.tested & (self.probability >= probability) & self.layout.is_cell
+        return FaultSet.of(likely | self.fault_set.mask, self.layout.n_cells)
 
     @cached_property
     def verdicts(self) -> NDArray[np.object_]:
         """Array ``[D]`` of :class:`Verdict`. A position without a cell is UNTESTED."""
-        code = np.where(self.tested & self.layout.present.ravel(), Verdict.ALIVE, Verdict.UNTESTED)
+        code = np.where(self.tested & self.layout.is_cell, Verdict.ALIVE, Verdict.UNTESTED)
         code[self.fault_set.mask] = Verdict.FAULTY
         # Enum members: NumPy would convert them to integers.
         return np.array(list(Verdict), dtype=object)[code]
@@ -232,7 +231,7 @@ class Diagnosis:
         signs = np.where(self.verdicts == Verdict.UNTESTED, "?", ".")
         for fault in self.faults:
             signs[list(fault.cells)] = LETTERS[fault.kind]
-        grid = self.layout.grid(np.where(self.layout.present.ravel(), signs, " "))
+        grid = self.layout.grid(np.where(self.layout.is_cell, signs, " "))
         names = [f"pad {pad + count_from}" for pad in range(self.layout.pads)]
         width = max(2 * self.layout.shape[2] - 1, len(names[-1]))
         lines = ["   ".join(["    ", *(name.ljust(width) for name in names)]).rstrip()]
@@ -281,7 +280,7 @@ class Diagnosis:
             kind[list(fault.cells)] = str(fault.kind)
             if fault.line is not None:
                 line[list(fault.cells)] = str(fault.line)
-        cells = np.flatnonzero(self.layout.present.ravel())
+        cells = np.flatnonzero(self.layout.is_cell)
         places = [self.layout.position(cell) for cell in cells.tolist()]
         pad, row, column = zip(*places, strict=True)
         axis = {"axis": cells % self.layout.axes} if self.layout.axes > 1 else {}
@@ -370,40 +369,34 @@ class Diagnosis:
             )
         except (KeyError, TypeError, AttributeError, OverflowError) as error:
             raise ValueError(f"the diagnosis is damaged: {type(error).__name__} {error}") from None
-        size = (diagnosis.layout.n_cells,)
-        vectors = {
-            "probability": diagnosis.probability,
-            "verdicts": diagnosis.tested,
-            **diagnosis.evidence,
-        }
-        for name, vector in vectors.items():
-            if vector.shape != size:
-                raise ValueError(
-                    f"the diagnosis is damaged: {name} has shape {list(vector.shape)}, expected"
-                    f" {list(size)}"
-                )
-        if not ((diagnosis.probability >= 0) & (diagnosis.probability <= 1)).all():
-            raise ValueError("the diagnosis is damaged: a probability is not between 0 and 1")
-        if not all(
-            isinstance(n, int) and n >= 0 for n in (diagnosis.n_frames, diagnosis.n_recordings)
-        ):
-            raise ValueError(
-                "the diagnosis is damaged: n_frames and n_recordings must be whole numbers >= 0"
-            )
-        if not all(
-            isinstance(t.reason, str) and isinstance(t.kind, str) for t in diagnosis.transport
-        ):
-            raise ValueError(
-                "the diagnosis is damaged: a transport fault needs a kind and a reason"
-            )
-        if not all(np.isfinite(values).all() for values in diagnosis.evidence.values()):
-            raise ValueError("the diagnosis is damaged: evidence must be finite")
-        # raise ValueError for cells of another layout
-        _ = (
-            diagnosis.statically_loaded,
-            diagnosis.fault_set,
-        )
+        diagnosis._check()
         return diagnosis
+
+    def _check(self) -> None:
+        """Raise ValueError where a stored diagnosis does not fit together."""
+        size = (self.layout.n_cells,)
+        vectors = {"probability": self.probability, "verdicts": self.tested, **self.evidence}
+        wrong = [
+            f"{name} has shape {list(vector.shape)}, expected {list(size)}"
+            for name, vector in vectors.items()
+            if vector.shape != size
+        ]
+        fits = {
+            "a probability is not between 0 and 1": (
+                (self.probability >= 0) & (self.probability <= 1)
+            ).all(),
+            "n_frames and n_recordings must be whole numbers >= 0": all(
+                isinstance(n, int) and n >= 0 for n in (self.n_frames, self.n_recordings)
+            ),
+            "a transport fault needs a kind and a reason": all(
+                isinstance(t.reason, str) and isinstance(t.kind, str) for t in self.transport
+            ),
+            "evidence must be finite": all(np.isfinite(of).all() for of in self.evidence.values()),
+        }
+        wrong += [what for what, is_right in fits.items() if not is_right]
+        if wrong:
+            raise ValueError(f"the diagnosis is damaged: {wrong[0]}")
+        _ = self.statically_loaded, self.fault_set  # raise ValueError for cells of another layout
 
 
 def _recordings_of(about: Mapping[str, Any] | None, n_cells: int) -> dict[str, Any]:

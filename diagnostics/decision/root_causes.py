@@ -11,112 +11,29 @@ reported as several faults. With declared wiring the wires are buses and nested 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from diagnostics.decision.cell_findings import (
+    OF_WIRES,
+    REFUTED_KINDS,
+    CellFindings,
+    Floats,
+    Mask,
+)
 from diagnostics.decision.line_cover import Cause, solve
+from diagnostics.decision.sentences import alternatives_of, reason_of
 from diagnostics.faults import Fault, FaultKind
 from diagnostics.layout import SensorLayout
 from diagnostics.preprocessing.levels import ANYWHERE, MAJORITY, SLIGHT, SUSPICIOUS
-from diagnostics.wiring import LineKind, action, counted
-
-# Of cells that move and are proved not to be alive.
-REFUTED_KINDS = (
-    FaultKind.FLOATING,
-    FaultKind.INTERMITTENT,
-    FaultKind.LATE,
-    FaultKind.COPY,
-    FaultKind.CLAMPED,
-    FaultKind.WEAK,
-)
+from diagnostics.wiring import LineKind
 
 _HELD = (FaultKind.OPEN, FaultKind.SHORT, FaultKind.STUCK)
 
 # Faults of a wire that all cells on it show, touched or not.
 _WITHOUT_CONTACT = (*_HELD, FaultKind.FLOATING)
-
-# Those that a wire has which fails now and then, as one that opens under load.
-OF_WIRES = REFUTED_KINDS[:2]
-
-Floats = NDArray[np.float64]
-Mask = NDArray[np.bool_]
-
-
-@dataclass(frozen=True)
-class CellFindings:
-    """Findings about each cell, arrays ``[D]``; masks are bool.
-
-    Attributes:
-        faulty: certainly faulty cells.
-        alive: cells that move as no dead cell does.
-        silent: cells that deliver no reading, or no longer do.
-        rests: constant cells at their baseline.
-        full: constant cells at full scale, and not at their baseline.
-        zero: constant cells at 0, and not at their baseline; None for sensors that rest low.
-        typical: float, reading that is told of constant cells; None: ``value``.
-        intermittent, noisy, drifting: cells that move, but wrongly.
-        gain: float, gain relative to the reference of cells with a changed gain; NaN: others.
-        value: float, reading (not load) of constant cells, and reading to which intermittent cells
-            blink; NaN: none.
-        since: int, number of the first frame of the fault.
-        probability: float, P(faulty).
-        weight: float, log likelihood ratio faulty : healthy.
-        events: int, number of events that tested the cell, or number of its blinks.
-        known: cells that were dead in the reference already.
-        refuted: int, number in ``REFUTED_KINDS`` of cells that move and are proved not to be alive;
-            -1: others.
-        unsure: int, the same of cells that may have one of the ``OF_WIRES``; -1: others.
-        wire: int, number of the proven wire of such a cell, from 0; -1: others.
-        of_wire: float, P(this wire fails).
-        share: float, of the contacts in which such a cell was dead.
-        as_one: bool, cells that read as one with those of their wire, while it fails.
-    """
-
-    faulty: Mask
-    alive: Mask
-    silent: Mask
-    rests: Mask
-    full: Mask
-    intermittent: Mask
-    noisy: Mask
-    drifting: Mask
-    gain: Floats
-    value: Floats
-    since: NDArray[np.intp]
-    probability: Floats
-    weight: Floats
-    events: NDArray[np.intp]
-    known: Mask
-    refuted: NDArray[np.intp]
-    unsure: NDArray[np.intp]
-    wire: NDArray[np.intp]
-    of_wire: Floats
-    share: Floats
-    as_one: Mask
-    zero: Mask | None = None
-    typical: Floats | None = None
-
-    def of(self, cells: NDArray[np.intp]) -> CellFindings:
-        """Return the findings in the order of ``cells``."""
-        return replace(
-            self,
-            **{name: values[cells] for name, values in vars(self).items() if values is not None},
-        )
-
-    def without(self, cells: Mask) -> CellFindings:
-        """Return the findings without those about some cells, bool ``[D]``, which have readings but
-        were not tested."""
-        masks = ("faulty", "alive", "rests", "full", "zero", "intermittent", "noisy", "drifting")
-        numbers = ("refuted", "unsure", "wire")
-        found = {name: getattr(self, name) for name in (*masks, *numbers)}
-        return replace(
-            self,
-            probability=np.where(cells, np.minimum(self.probability, MAJORITY), self.probability),
-            **{name: found[name] & ~cells for name in masks if found[name] is not None},
-            **{name: np.where(cells, -1, found[name]) for name in numbers},
-        )
 
 
 def root_causes(
@@ -136,18 +53,11 @@ def root_causes(
         # higher prevalence.
         common = (1 - ANYWHERE) / 2 * singles / int((found.alive | found.faulty).sum())
         causes = _causes(found, aliased, layout, common)
-    proven = [
-        _fault(kind, value, cause, found, layout) for kind, value, cause in causes if cause.proven
-    ]
+    told = [(_fault(*one, found, layout), one[2].proven) for one in causes]
+    proven = [fault for fault, is_proven in told if is_proven]
     faults = _addresses_of_dead_rows([*aliases, *proven], found, layout)
-    possible = [
-        _fault(kind, value, cause, found, layout)
-        for kind, value, cause in causes
-        if not cause.proven
-    ]
-    return tuple(sorted(faults, key=lambda fault: (-len(fault.cells), fault.cells))), tuple(
-        possible
-    )
+    faults.sort(key=lambda fault: (-len(fault.cells), fault.cells))
+    return tuple(faults), tuple(fault for fault, is_proven in told if not is_proven)
 
 
 def pulling(faults: Sequence[Fault], pulled: Mask, layout: SensorLayout) -> tuple[Fault, ...]:
@@ -218,9 +128,7 @@ def _causes(
             contradicting &= ~(consistent & ~faulty & (found.since <= begun) & (begun > 0))
         if kind in _WITHOUT_CONTACT:
             contradicting |= ~consistent & ~found.silent
-        explained = _explained(
-            faulty & ~aliased, consistent & ~aliased, contradicting, found, layout, common
-        )
+        explained = _explained(faulty, consistent, contradicting, ~aliased, found, layout, common)
         causes += [(kind, value, cause) for cause in explained]
     return causes
 
@@ -262,9 +170,7 @@ def _of_failing_wires(
     consistent = (likely >= 0) & (likely < len(OF_WIRES))
     contradicting = (found.alive | found.faulty) & ~consistent | aliased
     faulty = found.faulty & consistent
-    explained = _explained(
-        faulty & ~aliased, consistent & ~aliased, contradicting, found, layout, common
-    )
+    explained = _explained(faulty, consistent, contradicting, ~aliased, found, layout, common)
     wires: list[tuple[FaultKind, float | None, Cause]] = []
     for cause in explained:
         kind = OF_WIRES[int(np.median(likely[list(cause.seen)]))]
@@ -281,15 +187,18 @@ def _explained(
     faulty: Mask,
     consistent: Mask,
     contradicting: Mask,
+    free: Mask,
     found: CellFindings,
     layout: SensorLayout,
     common: float,
 ) -> tuple[Cause, ...]:
-    """Return the causes of cells with the same fault; see ``solve``.
+    """Return the causes of ``free`` cells with the same fault; see ``solve``.
 
     Cells that were dead in the reference are no evidence for a wire that broke later, though they
     may lie on it. A wire that was broken in the reference explains such cells only.
     """
+    faulty = faulty & free
+    consistent = consistent & free
     known = found.known & faulty
 
     def of(faulty: Mask, consistent: Mask, contradicting: Mask) -> tuple[Cause, ...]:
@@ -359,16 +268,12 @@ def _fault(
         elif (
             found.zero is not None and kind is FaultKind.OPEN
         ):  # at rest, which is not the lower end
-            low = SLIGHT * layout.full_scale
-            high = (1 - SLIGHT) * layout.full_scale
-            kind = (
-                FaultKind.SHORT
-                if value >= high
-                else FaultKind.OPEN
-                if value <= low
-                else FaultKind.STUCK
-            )
-        if kind in (FaultKind.OPEN, FaultKind.SHORT, FaultKind.STUCK):
+            kind = FaultKind.STUCK
+            if value >= (1 - SLIGHT) * layout.full_scale:
+                kind = FaultKind.SHORT
+            elif value <= SLIGHT * layout.full_scale:
+                kind = FaultKind.OPEN
+        if kind in _HELD:
             value = _middle((found.value if found.typical is None else found.typical)[seen])
     start = int(np.median(found.since[seen]))
     fault = Fault(
@@ -382,9 +287,9 @@ def _fault(
         ),
         evidence=int(found.events[seen].sum()),
     )
-    fault = replace(fault, reason=_reason(fault, cause, found, layout))
+    fault = replace(fault, reason=reason_of(fault, cause, found, layout))
     if cause.proven and cause.line is not None and cause.line.kind in ("row", "column"):
-        fault = replace(fault, alternatives=_alternatives(fault, cause, found, layout))
+        fault = replace(fault, alternatives=alternatives_of(fault, cause, found, layout))
     return fault
 
 
@@ -393,164 +298,6 @@ def _middle(readings: Floats) -> float:
     if (readings == np.rint(readings)).all():
         return float(np.sort(readings)[(len(readings) - 1) // 2])
     return float(np.median(readings))
-
-
-_DOING = {
-    FaultKind.INTERMITTENT: "blinks between its load and {value:.4g} {unit}",
-    FaultKind.NOISY: "is far noisier than a healthy cell under the same load",
-    FaultKind.DRIFT: "moves, but never returns to its baseline",
-    FaultKind.FLOATING: "moves by itself, whatever the cells around it read",
-    FaultKind.LATE: "follows the cells around it about {value:.0f} frames late",
-    FaultKind.WEAK: "reads {value:.2g} times what it should",
-    FaultKind.CLAMPED: (
-        "never reads more than {value:.4g} {unit}, however much the cells around it are loaded"
-    ),
-}
-
-
-_CHECKS = {
-    FaultKind.OPEN: "its solder joint and trace",
-    FaultKind.INTERMITTENT: "its solder joint and trace for a loose contact",
-    FaultKind.NOISY: "its connection and shielding",
-    FaultKind.DRIFT: "the cell for wear or dirt, and calibrate it again",
-    FaultKind.FLOATING: "its trace for a break: an open input picks up what is around it",
-    FaultKind.LATE: "the converter and the buffer that it is read from",
-    FaultKind.COPY: "the multiplexer and the order in which cells are read",
-    FaultKind.WEAK: "the cell for wear or dirt, and calibrate it again",
-    FaultKind.CLAMPED: "its amplifier and supply",
-}
-
-
-def _does(fault: Fault, found: CellFindings, layout: SensorLayout) -> str:
-    gain = found.gain[list(fault.cells)]
-    if fault.kind in (FaultKind.DRIFT, FaultKind.WEAK) and np.isfinite(gain).any():
-        return (
-            f"is loaded when the others are, but reads about {np.nanmedian(gain):.2g} times what it"
-            " should"
-        )
-    if fault.kind is FaultKind.COPY:
-        source = (
-            "the mean of the cells beside it"
-            if fault.value is None
-            else layout.place(int(fault.value))
-        )
-        return f"repeats {source}"
-    comes_and_goes = np.max([found.refuted, found.unsure, found.wire], axis=0) >= 0
-    if fault.kind is FaultKind.INTERMITTENT and comes_and_goes[list(fault.cells)].any():
-        share = float(np.median(found.share[list(fault.cells)]))
-        if found.as_one[list(fault.cells)].any():
-            return f"reads what all others on it read, or does not change, {share:.0%} of the time"
-        return (
-            f"reads nothing in {share:.0%} of the contacts that load the cells around it, and its"
-            " load in the others"
-        )
-    if fault.kind in _DOING:
-        return _DOING[fault.kind].format(value=fault.value or 0.0, unit=layout.unit)
-    if found.silent[fault.cells[0]]:
-        return "delivers no reading"
-    return f"reads {fault.value or 0.0:.4g} {layout.unit}"
-
-
-def _reason(fault: Fault, cause: Cause, found: CellFindings, layout: SensorLayout) -> str:
-    """Return one sentence: what was observed, and what to check."""
-    does = _does(fault, found, layout)
-    if not cause.proven:
-        few = f"{len(cause.seen)} cells on it" if len(cause.seen) > 1 else "1 cell on it"
-        return (
-            f"{fault.line} may {_infinitive(fault.kind)}{_where(fault, cause, layout)} (P ="
-            f" {fault.probability:.2f}), or only {few}, each of which {does}: one more contact"
-            " along it will tell"
-        )
-    already = ", and did so in the reference already" if found.known[list(cause.seen)].all() else ""
-    since = (
-        ""
-        if fault.onset is None
-        else f" from frame {fault.onset} on ({fault.onset / layout.rate:.1f} s)"
-    )
-    if fault.line is None:
-        whatever = (
-            "" if fault.kind in _DOING or found.silent[fault.cells[0]] else ", whatever touches it"
-        )
-        check = _CHECKS.get(fault.kind, "the cell and its traces for a short circuit")
-        return (
-            f"{layout.place(fault.cells[0])} {fault.kind.verb()}: it {does}{since}{whatever}"
-            f"{already}; check {check}"
-        )
-    inferred = len(cause.cells) - len(cause.seen)
-    are = "is" if inferred == 1 else "are"
-    if fault.line.kind in ("position", "bus", "group"):
-        silent = (
-            "are silent"
-            if found.silent[fault.cells[0]]
-            else f"{fault.kind.verb(plural=True)}: each cell {does}"
-        )
-        also = f"; {inferred} of the cells, not tested, {are} inferred" if inferred else ""
-        return f"{action(fault.line)}: {_behind(fault, layout)} {silent}{since}{already}{also}"
-    also = f"; {inferred} more, not tested, {are} inferred from the wire" if inferred else ""
-    seen = f"each of {len(cause.seen)} cells on it {does}{since}{already}{also}"
-    of_converter = fault.line.kind == "converter"
-    check = (
-        "the converter channel and its cable"
-        if of_converter
-        else f"the {fault.line.kind} wire and its address"
-    )
-    return f"{fault.line} {fault.kind.verb()}{_where(fault, cause, layout)}: {seen}; check {check}"
-
-
-def _infinitive(kind: FaultKind) -> str:
-    """Return the verb as it follows "may": "be stuck"."""
-    verb = kind.verb()
-    return f"be {verb[3:]}" if verb.startswith("is ") else kind.verb(plural=True)
-
-
-def _behind(fault: Fault, layout: SensorLayout) -> str:
-    """Return what a dead bus or group holds, as "all 4 triangles behind it"."""
-    assert fault.line is not None
-    cells = len(layout.cells_on(fault.line))
-    if len(fault.cells) < cells:
-        return f"{len(fault.cells)} of {cells} cells on it"
-    parts = layout.parts(fault.line)
-    if len(parts) > 1:
-        return f"all {counted(parts)} behind it"
-    return f"all {cells} {'axes' if fault.line.kind == 'position' else 'cells'} on it"
-
-
-def _where(fault: Fault, cause: Cause, layout: SensorLayout) -> str:
-    """Return the part of its line that a fault affects, as " from column 5 on" or " up to column
-    4"; "": all of it."""
-    if cause.whole or fault.line is None:
-        return ""
-    across, name = (2, "column") if fault.line.kind == "row" else (1, "row")
-    dead = [layout.position(cell)[across] for cell in fault.cells]
-    on_line = [layout.position(cell)[across] for cell in layout.cells_on(fault.line).tolist()]
-    return (
-        f" from {name} {min(dead)} on"
-        if max(dead) == max(on_line)
-        else f" up to {name} {max(dead)}"
-    )
-
-
-def _alternatives(
-    fault: Fault, cause: Cause, found: CellFindings, layout: SensorLayout
-) -> tuple[str, ...]:
-    """Return other causes with the same findings: the address of a dead line, or a break further
-    along it."""
-    assert fault.line is not None
-    others = []
-    cells = layout.cells_on(fault.line)
-    if cause.whole and fault.kind in (FaultKind.OPEN, FaultKind.SHORT):
-        others.append(f"the address or the multiplexer output of {fault.line}, not its wire")
-    untested = ~found.alive & ~found.faulty
-    unseen = np.setdiff1d(cells, np.array(cause.seen))
-    if cause.whole and fault.kind is FaultKind.OPEN and untested[unseen].any():
-        others.append(f"a break in {fault.line} that leaves the untested cells on it alive")
-    if not cause.whole and untested[cells].any():
-        edge = fault.cells[0] if fault.cells[-1] == cells[-1] else fault.cells[-1]
-        i = int(np.searchsorted(cells, edge))
-        beside = cells[i - 1] if edge == fault.cells[0] else cells[min(i + 1, len(cells) - 1)]
-        if untested[beside]:
-            others.append("a break one or more untested cells closer to the working end")
-    return tuple(others)
 
 
 def _addresses_of_dead_rows(

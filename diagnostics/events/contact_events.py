@@ -43,6 +43,8 @@ _PERSISTING = 0.65  # share of the loaded cells that hold their value: then the 
 _SAME_PLACE = 0.6  # cosine between mean loads from which on two events load the same cells
 THE_SAME = 0.95  # cosine from which on they are the same
 
+Cells = NDArray[np.intp]
+
 
 @dataclass(frozen=True)
 class Summary:
@@ -160,7 +162,7 @@ class ContactEvent:
         size = float(np.sqrt((before @ before) * (now @ now)))
         return size <= _MIN_AMPLITUDE**2 or float(before @ now) >= _SAME_PLACE * size
 
-    def persists(self, part: Summary, root_near: float, start: NDArray[np.intp]) -> bool:
+    def persists(self, part: Summary, root_near: float, start: Cells) -> bool:
         """Return whether most of its loaded cells hold the same value in ``part``; see
         ``EventLog.extend``.
 
@@ -201,13 +203,7 @@ class EventLog:
     releasing: bool = False
     last: Array | None = None
 
-    def extend(
-        self,
-        root: Array,
-        numbers: NDArray[np.intp],
-        root_near: float,
-        start: NDArray[np.intp],
-    ) -> EventLog:
+    def extend(self, root: Array, numbers: Cells, root_near: float, start: Cells) -> EventLog:
         """Return the events after more frames.
 
         Args:
@@ -221,26 +217,24 @@ class EventLog:
         largest = self.largest
         releasing = self.releasing
         last = self.last
-        ongoing = bool(kept) and not releasing  # the next part belongs to the last event
         begin = 0
         constant = start <= numbers[0]
         # (moving, all)
         weights = np.stack([~constant, np.ones_like(constant)], axis=1).astype(np.float32)
         before = np.concatenate([root[:1] if last is None else last[None], root[:-1]])
         begins = self._begins(root, before, numbers, root_near, start)
-        edges = sorted({*begins, len(root)})
         while begin < len(root):
             if releasing:
                 begin += _releasing_frames(root[begin:], last)
                 if begin == len(root):
                     break
-                releasing = ongoing = False
-            edges = [edge for edge in edges if edge > begin]
-            ahead = root[begin : edges[0]]
+            follows = bool(kept) and begin not in begins
+            ongoing = follows and not releasing  # the next part belongs to the last event
+            edge = min((edge for edge in begins if edge > begin), default=len(root))
+            ahead = root[begin:edge]
             lowest = so_far(np.minimum, ahead)
             highest = so_far(np.maximum, ahead)
             if begin in begins:
-                ongoing = False
                 # The load of this event rose in one frame, from the frame before.
                 lowest = np.minimum(lowest, before[begin])
             elif ongoing:
@@ -248,27 +242,22 @@ class EventLog:
                 highest = np.maximum(highest, kept[-1].highest)
             # Loads that are constant since the event began would have to be released.
             held = constant & (start >= (kept[-1].since if ongoing else numbers[begin]))
-            weakest = max(
-                _WEAKEST * largest, _MIN_AMPLITUDE, _LEAST_OF_HELD * float(ahead[0] @ held)
-            )
+            least = _LEAST_OF_HELD * float(ahead[0] @ held)
+            weakest = max(_WEAKEST * largest, _MIN_AMPLITUDE, least)
             end = _release(ahead @ weights, lowest @ weights, highest @ weights, weakest)
             if end:
                 part = Summary.of(ahead[:end], int(numbers[begin]), root_near)
-                low = lowest[end - 1]
-                high = highest[end - 1]
-                same = ongoing and kept[-1].same_location(part, low)
-                follows = bool(kept) and begin not in begins
+                extremes = lowest[end - 1], highest[end - 1]
+                same = ongoing and kept[-1].same_location(part, extremes[0])
                 if same or (follows and kept[-1].persists(part, root_near, start)):
-                    kept[-1] = kept[-1].grown(part, low, high)
+                    kept[-1] = kept[-1].grown(part, *extremes)
                 else:
-                    if kept:
-                        largest = max(largest, kept[-1].amplitude(weights[:, 1]))
+                    largest = max([largest, *(one.amplitude(weights[:, 1]) for one in kept[-1:])])
                     since = kept[-1].released_since(part, ongoing) if follows else part.first
-                    kept.append(ContactEvent((part,), low, high, since))
-                ongoing = True
+                    kept.append(ContactEvent((part,), *extremes, since))
             begin += end
-            if begin < edges[0]:
-                releasing = True
+            releasing = begin < edge
+            if releasing:
                 last = root[begin]
                 begin += 1
         return EventLog(tuple(kept), largest, releasing, root[-1])
@@ -277,9 +266,9 @@ class EventLog:
         self,
         root: Array,
         before: Array,
-        numbers: NDArray[np.intp],
+        numbers: Cells,
         root_near: float,
-        start: NDArray[np.intp],
+        start: Cells,
     ) -> list[int]:
         """Return the frames in which a load vanishes and another appears elsewhere, as where a
         recording begins."""
@@ -313,7 +302,7 @@ def count_repeats(
     events: Sequence[ContactEvent],
     least: float = _SAME_PLACE,
     among: NDArray[np.bool_] | slice = slice(None),
-) -> NDArray[np.intp]:
+) -> Cells:
     """Return for each event the number of earlier events that load about the same cells, int
     ``[n]``.
 

@@ -15,14 +15,14 @@ detected: what moves by itself, gains, wires of which no cell is tested.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from diagnostics.decision.calibration import calibrated, faulty_at, probability_of
+from diagnostics.decision.cell_findings import CellFindings
 from diagnostics.decision.judged import Judged
-from diagnostics.decision.root_causes import CellFindings
 from diagnostics.events.contact_events import EventLog
 from diagnostics.events.tiled_events import TiledEvents
 from diagnostics.events.tiles import Rectangle, tiles
@@ -342,57 +342,51 @@ def _findings(
     runs = stream.runs
     frames = stream.intermittency
     rests = stream.rests()
-    odds = calibrated(spatial.evidence, temporal, runs.moved, rests, tested=spatial.surprisal > 0)
+    tested = spatial.surprisal > 0
+    odds = calibrated(spatial.evidence, temporal, runs.moved, rests, tested=tested)
+    weight = calibrated(spatial.surprisal, temporal, runs.moved, rests, tested=tested)
     dead = stream.reference.dead
     known = spatial.scored & ~runs.moved & (dead > 0)
     stuck = probability_of(odds, runs.moved, spatial.scored & ~known)
     stuck[known] = dead[known]
     silent = stream.silent & ~explained
-    delivers = stream.present & ~explained & ~silent
+    free = stream.present & ~explained
+    delivers = free & ~silent
     intermittent = frames.intermittent & delivers
     noisy = frames.excess & delivers
     drifting = delivers & ~intermittent & ~noisy & spatial.drifting & (stream.crosstalk is None)
     certain = silent | intermittent | noisy | drifting
     probability = np.where(stream.present, np.where(certain, 1 - RARE, stuck), 0.0)
-    faulty = faulty_at(np.where(certain, 0.0, probability), rate) | certain
-    faulty &= stream.present & ~explained
-    at_rest = spatial.scored & rests
+    faulty = (faulty_at(np.where(certain, 0.0, probability), rate) | certain) & free
     beyond = spatial.scored & ~rests
     held = stream.reading(runs.value)
     tolerance = 2 * stream.reference.tolerance
-    weight = calibrated(
-        spatial.surprisal, temporal, runs.moved, rests, tested=spatial.surprisal > 0
-    )
-    since = np.select(
-        [silent, intermittent, noisy, drifting],
-        [runs.missed_since, frames.blinks_since, frames.noisy_since, 0],
-        runs.start,
-    )
-    none = np.full(len(held), -1)
+    unsaid: dict[str, Any] = dict.fromkeys(("refuted", "unsure", "wire"), np.full(len(held), -1))
+    unsaid |= dict.fromkeys(("of_wire", "share"), np.zeros(len(held)))
     return CellFindings(
         faulty=faulty,
         # A cell that moved is alive, unless it is suspected since.
-        alive=stream.present & ~explained & ~faulty & runs.moved & (probability < DOUBTED),
+        alive=free & ~faulty & runs.moved & (probability < DOUBTED),
         silent=silent,
-        rests=at_rest,
+        rests=spatial.scored & rests,
         full=beyond & (held >= full_scale - tolerance),
         zero=None if stream.load is None else beyond & (held <= tolerance),
         intermittent=intermittent,
         noisy=noisy,
         drifting=drifting,
         value=np.where(intermittent, stream.blinks_to(full_scale), held),
-        since=since,
+        since=np.select(
+            [silent, intermittent, noisy, drifting],
+            [runs.missed_since, frames.blinks_since, frames.noisy_since, 0],
+            runs.start,
+        ),
         probability=probability,
         # A cell at rest supports a broken line by the events alone, without the prior of its value.
         weight=np.where(known, CERTAIN_RATIO, weight),
         events=np.where(intermittent, frames.blinks, spatial.events),
         known=known,
         gain=np.full(len(held), np.nan),
-        refuted=none,
-        unsure=none,
-        wire=none,
-        of_wire=np.zeros(len(held)),
-        share=np.zeros(len(held)),
+        **unsaid,
         as_one=np.zeros(len(held), bool),
         typical=stream.typical_reading(),
     )

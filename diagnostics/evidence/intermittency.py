@@ -38,7 +38,9 @@ from diagnostics.preprocessing.readings import SEGMENT
 if TYPE_CHECKING:
     from diagnostics.preprocessing.scale import Array, Scale
 
+Cells = NDArray[np.intp]
 Floats = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 
 _FOLDS = 4
 _BLINK_RATE = 0.05  # blinks per loaded frame of a loose contact
@@ -59,6 +61,7 @@ _LEVELS = np.array([0.0, 0.05, 0.2, 0.4, 0.6, 0.8])
 # share of the loaded cells, and of all, that may be noisy together: with more the contact moves
 _CROWD = 0.25
 _THRESHOLD = 14.0  # of the CUSUM: a prior of one in a thousand, and P(faulty) = 0.999
+_QUIET = float(np.log((1 - _NOISY_SHARE) / (1 - _RARE)))  # log ratio of a segment below the limit
 _MAX = 40.0  # upper limit of the CUSUM, so that a repaired cell is cleared soon
 _HEALTHY = 0.99  # quantile of the cells, of the largest CUSUM in the reference
 
@@ -70,7 +73,7 @@ class _Counts(NamedTuple):
     blinks: Floats
     loaded: Floats
     noise: Floats
-    level: NDArray[np.intp]
+    level: Cells
 
     @classmethod
     def of(
@@ -201,10 +204,10 @@ class Intermittency:
     layout: SensorLayout
     blinking: Floats
     noisy: Floats
-    blinks: NDArray[np.intp]
-    high: NDArray[np.intp]
-    blinks_since: NDArray[np.intp]
-    noisy_since: NDArray[np.intp]
+    blinks: Cells
+    high: Cells
+    blinks_since: Cells
+    noisy_since: Cells
     lowest: float = np.inf
 
     @classmethod
@@ -218,12 +221,12 @@ class Intermittency:
         self,
         frames: Floats,
         root: Array,
-        numbers: NDArray[np.intp],
+        numbers: Cells,
         scale: Scale,
         usual: HealthyRates,
-        constant: NDArray[np.bool_],
+        constant: Mask,
         full: float = _MAX,
-        begins: NDArray[np.bool_] | None = None,
+        begins: Mask | None = None,
     ) -> Intermittency:
         """Return the sums after one more segment.
 
@@ -243,14 +246,9 @@ class Intermittency:
         if len(frames) < SHORTEST_RUN or constant.all():
             return self
         moving = np.flatnonzero(~constant)
-        lowest = min(
-            self.lowest,
-            (
-                usual.lowest
-                if np.isfinite(usual.lowest)
-                else _lowest_load(frames[:, moving], scale.of(moving))
-            ),
-        )
+        lowest = min(self.lowest, usual.lowest)
+        if not np.isfinite(usual.lowest):
+            lowest = min(lowest, _lowest_load(frames[:, moving], scale.of(moving)))
         low, high, loaded, noise_level, level = _measure(
             frames, root, scale, moving, self.layout, usual.alone, lowest, recording
         )
@@ -265,57 +263,48 @@ class Intermittency:
         noisier = self._noisier(noise_level, usual.noise[level], moving, usual.alone)
         if noisier.sum() > max(crowd, _CROWD * len(constant)):
             noisier[:] = False
-        noisy = self.noisy + usual.noise_counts * np.log((1 - _NOISY_SHARE) / (1 - _RARE))
-        more = usual.noise_counts * np.log(_NOISY_SHARE / _RARE)
-        noisy[moving] = np.where(noisier, self.noisy[moving] + more, noisy[moving])
-        noisy = np.clip(noisy, 0.0, full)
-        blinks = np.zeros(len(constant), np.intp)
-        to_full = np.zeros(len(constant), np.intp)
-        blinks[moving] = events
-        to_full[moving] = np.where(events > 0, high, 0)
+        odds = np.where(noisier, np.log(_NOISY_SHARE / _RARE), _QUIET)
+        blinks = np.zeros((2, len(constant)), np.intp)
+        blinks[:, moving] = events, np.where(events > 0, high, 0)
         calm = self.blinking == 0
-        quiet = self.noisy == 0
         return Intermittency(
             self.layout,
             blinking,
-            noisy,
-            np.where(calm, 0, self.blinks) + blinks,
-            np.where(calm, 0, self.high) + to_full,
+            np.clip(self.noisy + usual.noise_counts * odds, 0.0, full),
+            np.where(calm, 0, self.blinks) + blinks[0],
+            np.where(calm, 0, self.high) + blinks[1],
             np.where(calm, numbers[0], self.blinks_since),
-            np.where(quiet, numbers[0], self.noisy_since),
+            np.where(self.noisy == 0, numbers[0], self.noisy_since),
             lowest,
         )
 
-    def _noisier(
-        self, noise: Floats, limit: Floats, moving: NDArray[np.intp], alone: bool
-    ) -> NDArray[np.bool_]:
-        """Return which of the ``moving`` cells have more noise than the limit, bool ``[n]``;
+    def _noisier(self, noise: Floats, limit: Floats, moving: Cells, alone: bool) -> Mask:
+        """Return which of the ``moving`` cells have more noise than the limit, bool ``[D]``;
         ``alone``: unshared."""
-        noisier = noise > limit
+        noisier = np.zeros(self.layout.n_cells, bool)
+        noisier[moving] = noise > limit
         if alone and noisier.any():
             every = np.zeros(self.layout.n_cells)
-            which = np.flatnonzero(noisier)
             every[moving] = noise
-            neighbours = self.layout.beside[moving[which]]
-            noisier[which] = ~_shared(neighbours, every[neighbours], noise[which])
+            which = np.flatnonzero(noisier)
+            neighbours = self.layout.beside[which]
+            noisier[which] = ~_shared(neighbours, every[neighbours], every[which])
         return noisier
 
     @property
-    def intermittent(self) -> NDArray[np.bool_]:
+    def intermittent(self) -> Mask:
         """bool ``[D]``, intermittent cells."""
-        found: NDArray[np.bool_] = (self.blinking >= _THRESHOLD) & (self.blinking > self.noisy)
+        found: Mask = (self.blinking >= _THRESHOLD) & (self.blinking > self.noisy)
         return found
 
     @property
-    def excess(self) -> NDArray[np.bool_]:
+    def excess(self) -> Mask:
         """bool ``[D]``, cells with excess noise that are not intermittent."""
-        found: NDArray[np.bool_] = (self.noisy >= _THRESHOLD) & ~self.intermittent
+        found: Mask = (self.noisy >= _THRESHOLD) & ~self.intermittent
         return found
 
 
-def _of_some_length(
-    frames: Floats, root: Array, recording: NDArray[np.intp]
-) -> tuple[Floats, Array, NDArray[np.intp]]:
+def _of_some_length(frames: Floats, root: Array, recording: Cells) -> tuple[Floats, Array, Cells]:
     """Return the frames, root loads and numbers ``[t]`` of the recordings without those of which
     there are too few frames here to tell of time."""
     enough = np.bincount(recording)[recording] >= SHORTEST_RUN
@@ -326,19 +315,19 @@ def _measure(
     frames: Floats,
     root: Array,
     scale: Scale,
-    cells: NDArray[np.intp],
+    cells: Cells,
     layout: SensorLayout,
     alone: bool,
     lowest: float,
-    recording: NDArray[np.intp] | None = None,
-) -> tuple[NDArray[np.intp], NDArray[np.intp], Floats, Floats, NDArray[np.intp]]:
+    recording: Cells | None = None,
+) -> tuple[Cells, Cells, Floats, Floats, Cells]:
     """Return for each of the ``cells``: blinks to the baseline, blinks to full scale, loaded
     frames, noise, load level.
 
     With ``alone``, blinks that a neighbour shares do not count. Only frames of one ``recording``
     (int ``[t]``, its number; None: all are of one) are compared.
     """
-    every = frames
+    every = frames if alone else None
     frames = frames.take(cells, axis=1)
     root = root.take(cells, axis=1)
     scale = scale.of(cells)
@@ -352,39 +341,6 @@ def _measure(
     full = frames >= top
     moderate = loaded & ~full
 
-    def blinks(initial: NDArray[np.bool_], away: NDArray[np.bool_]) -> NDArray[np.intp]:
-        # Away in one step and back in one step, to about the same load: no contact does that.
-        count = np.zeros(x.shape[1], np.intp)
-        left = initial[:-1] & away[1:]
-        if not left.any():
-            return count
-        some = np.flatnonzero(left.any(axis=0) & (away[:-1] & initial[1:]).any(axis=0))
-        if not len(some):
-            return count
-        loaded_before = initial[:, some]
-        absent = away[:, some]
-        of = x[:, some]
-        missing = absent
-        for gap in range(1, min(LONGEST_BLINK, len(x) - 2) + 1):
-            before = of[: -gap - 1]
-            after = of[gap + 1 :]
-            same_load = np.abs(after - before) <= ALIKE * before
-            if recording is not None:
-                same_load &= (recording[gap + 1 :] == recording[: -gap - 1])[:, None]
-            when, which = np.nonzero(
-                loaded_before[: -gap - 1] & missing[1:-1] & loaded_before[gap + 1 :] & same_load
-            )
-            which = some[which]
-            if alone and len(which):
-                neighbours = layout.beside[cells[which]]
-                change = np.abs(
-                    every[when[:, None] + 1, neighbours] - every[when[:, None], neighbours]
-                )
-                which = which[~_shared(neighbours, change, x[when, which])]
-            np.add.at(count, which, 1)
-            missing = missing[:-1] & absent[gap:]
-        return count
-
     step = x[1:] - x[:-1]
     curvature = (
         np.abs(step[1:] - step[:-1]) if len(x) > 2 else np.zeros((1, x.shape[1]), np.float32)
@@ -395,9 +351,59 @@ def _measure(
     level = np.searchsorted(_LEVELS, root.sum(axis=0) / np.float32(len(root)), side="right") - 1
     # A load near full scale may reach it without a fault.
     far = moderate & ((1 + ALIKE) * x < (top - scale.baseline).astype(np.float32))
-    low = blinks(moderate, rests)
-    high = blinks(far, full)
+    low = _blinks(x, moderate, rests, recording, every, layout.beside, cells)
+    high = _blinks(x, far, full, recording, every, layout.beside, cells)
     return low, high, loaded.sum(axis=0, dtype=np.float64), noise_level, np.maximum(level, 0)
+
+
+def _blinks(
+    x: Array,
+    initial: Mask,
+    away: Mask,
+    recording: Cells | None,
+    every: Floats | None,
+    beside: Cells,
+    cells: Cells,
+) -> Cells:
+    """Return how often each cell is away in one step and back in one step, to about the same load
+    ``x [t, n]``: no contact does that.
+
+    Args:
+        x, initial, away: ``[t, n]``: loads, where they may be left, and where they are away.
+        recording: as for :func:`_measure`.
+        every: ``[t, D]``, frames of all cells, whose neighbours may share a change, which does not
+            count then; None: all count.
+        beside: of the layout.
+        cells: int ``[n]``.
+    """
+    count = np.zeros(x.shape[1], np.intp)
+    left = initial[:-1] & away[1:]
+    if not left.any():
+        return count
+    some = np.flatnonzero(left.any(axis=0) & (away[:-1] & initial[1:]).any(axis=0))
+    if not len(some):
+        return count
+    loaded_before = initial[:, some]
+    absent = away[:, some]
+    of = x[:, some]
+    missing = absent
+    for gap in range(1, min(LONGEST_BLINK, len(x) - 2) + 1):
+        before = of[: -gap - 1]
+        after = of[gap + 1 :]
+        same_load = np.abs(after - before) <= ALIKE * before
+        if recording is not None:
+            same_load &= (recording[gap + 1 :] == recording[: -gap - 1])[:, None]
+        when, which = np.nonzero(
+            loaded_before[: -gap - 1] & missing[1:-1] & loaded_before[gap + 1 :] & same_load
+        )
+        which = some[which]
+        if every is not None and len(which):
+            neighbours = beside[cells[which]]
+            change = np.abs(every[when[:, None] + 1, neighbours] - every[when[:, None], neighbours])
+            which = which[~_shared(neighbours, change, x[when, which])]
+        np.add.at(count, which, 1)
+        missing = missing[:-1] & absent[gap:]
+    return count
 
 
 def _lowest_load(frames: Floats, scale: Scale) -> float:
@@ -407,7 +413,7 @@ def _lowest_load(frames: Floats, scale: Scale) -> float:
     return float(np.min(load, where=load > scale.near, initial=np.inf))
 
 
-def _shared(neighbours: NDArray[np.intp], change: Floats, own: Floats | Array) -> NDArray[np.bool_]:
+def _shared(neighbours: Cells, change: Floats, own: Floats | Array) -> Mask:
     """Return which changes of single cells a neighbour shares, bool ``[n]``.
 
     Exactly both neighbours on one row, or on one column, do not count: they may lie on the same bad

@@ -69,7 +69,7 @@ class NearestNeighbours:
         always = np.ones(shape)
         mean = np.zeros(shape)
         spread = np.full(shape[1], np.nan)
-        present = self.layout.present.ravel()
+        present = self.layout.is_cell
         usable = predictors & present
         known, scored = (_describe(of, usable, self.layout) for of in (self.log, features))
         enclosed = np.isfinite(scored).all(axis=(0, 2)) & present

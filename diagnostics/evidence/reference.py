@@ -95,7 +95,7 @@ class Reference:
         tolerance = tolerance_of(recordings, layout)
         dead = np.zeros(layout.n_cells) if dead is None else dead
         layout = living(layout, dead)
-        present = layout.present.ravel()
+        present = layout.is_cell
         level = levels(recordings, present, layout.full_scale)
         recordings = levelled(recordings, level)
         highest = baseline(recordings, present, tolerance, layout.full_scale)
@@ -146,5 +146,5 @@ def highest_reading(recordings: Sequence[NDArray[np.float64]], layout: SensorLay
     """Return the highest reading of a present cell that moves; full scale, if none moves above
     0."""
     low, high = RecordingBlocks.of(recordings).extremes()
-    moved = layout.present.ravel() & (high > low) & (high > 0)
+    moved = layout.is_cell & (high > low) & (high > 0)
     return float(high[moved].max()) if moved.any() else layout.full_scale

@@ -46,7 +46,7 @@ def find_reference_faults(
         diagnose: a cold-start diagnosis of the candidate cells (bool ``[D]``) with known baselines
             (float ``[D]``).
     """
-    present = layout.present.ravel()
+    present = layout.is_cell
     still = present & never_moved(recordings, tolerance)
     candidates = _enclosed_groups(still, layout)
     if not candidates.any() or still[present].mean() > MAJORITY:
@@ -71,7 +71,7 @@ def never_moved(recordings: RecordingBlocks, tolerance: float) -> NDArray[np.boo
 def _enclosed_groups(still: NDArray[np.bool_], layout: SensorLayout) -> NDArray[np.bool_]:
     """Return the groups of cells that are ``still`` in which one is enclosed by cells that moved,
     bool ``[D]``."""
-    moved = layout.grid(~still & layout.present.ravel())
+    moved = layout.grid(~still & layout.is_cell)
     groups = layout.connected(still)
     candidates: NDArray[np.bool_] = np.isin(groups, groups[_enclosed(moved).ravel() & still])
     return candidates

@@ -93,7 +93,7 @@ class RestLevel:
             tolerance: readings within +- this of a value count as that value.
             layout: the array.
         """
-        present = layout.present.ravel()
+        present = layout.is_cell
         ratio = np.zeros(layout.n_cells)
         known = np.flatnonzero(present & np.isfinite(self.level))
         tested = np.flatnonzero(present & rests & (runs.length >= SEGMENT))

@@ -72,7 +72,7 @@ class StreamState:
     ) -> None:
         self.layout = layout
         self.reference = reference
-        self.present = layout.present.ravel()
+        self.present = layout.is_cell
         self.order = order
         self.load = load
         self.below = np.zeros(layout.n_cells, bool)

@@ -11,8 +11,8 @@ from scipy.special import expit
 
 from diagnostics.decision.address_aliasing import find_aliasing
 from diagnostics.decision.calibration import faulty_at
+from diagnostics.decision.cell_findings import OF_WIRES, REFUTED_KINDS, CellFindings
 from diagnostics.decision.judged import Judged
-from diagnostics.decision.root_causes import OF_WIRES, REFUTED_KINDS, CellFindings
 from diagnostics.evidence.stream_state import StreamState
 from diagnostics.faults import Fault, FaultKind
 from diagnostics.layout import SensorLayout

@@ -105,9 +105,7 @@ class LoadDirection:
 def _learned(readings: RecordingBlocks, layout: SensorLayout) -> Rest:
     """Return the direction of load of the array, see the module."""
     low, high = readings.extremes()
-    moved = spread(
-        np.flatnonzero(layout.present.ravel() & (high - low > _MOVES * layout.full_scale))
-    )
+    moved = spread(np.flatnonzero(layout.is_cell & (high - low > _MOVES * layout.full_scale)))
     if not len(moved):
         return "low"
     low = low[moved]

@@ -3,7 +3,7 @@ copied whole."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any, overload
 
 import numpy as np
@@ -138,3 +138,12 @@ def _whole(given: NDArray[Any], present: NDArray[np.bool_]) -> NDArray[Any]:
         return given
     received = given[~np.isnan(given).all(axis=1, where=present)]
     return held(received, np.full(given.shape[1], np.nan))[1:]
+
+
+def complete(
+    recordings: Iterable[NDArray[Any]], otherwise: NDArray[np.float64]
+) -> list[NDArray[np.float64]]:
+    """Return the recordings ``[T, D]`` with the last reading where one is missing, ``otherwise``
+    ``[D]`` before the first, without those that have no reading."""
+    each = [np.asarray(recording, dtype=np.float64) for recording in recordings]
+    return [held(frames, otherwise)[1:] for frames in each if np.isfinite(frames).any()]

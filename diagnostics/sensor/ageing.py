@@ -84,7 +84,7 @@ def cell_condition(
     """
     old = _Measured.of([np.asarray(r, np.float64) for r in reference], layout)
     new = _Measured.of([np.asarray(r, np.float64) for r in recordings], layout, old)
-    absent = ~layout.present.ravel()
+    absent = ~layout.is_cell
     return CellCondition(
         *(
             np.where(absent, np.nan, statistic)

@@ -32,11 +32,11 @@ from scipy.stats import median_abs_deviation
 from sklearn.covariance import ledoit_wolf
 
 from diagnostics.preprocessing.levels import CERTAIN_RATIO, FEWEST, LIGHT, MAJORITY, SLIGHT
+from diagnostics.preprocessing.readings import complete
 from diagnostics.sensor.gain import GAIN
 from diagnostics.sensor.recalibration import (
     Fit,
     common_spread,
-    complete,
     neighbours_agree,
 )
 from diagnostics.sensor.rewiring import LIMIT
@@ -131,12 +131,12 @@ def find_another_sensor(
     if reference.model is None or not healthy:
         return None
     some = healthy[:: -(-len(healthy) // _MOST_COMPARED)]
-    usual = [frames for one in some if (frames := complete(one, reference)) is not None]
+    usual = complete(some, reference.scale.baseline)
     numbers = [i for i, one in enumerate(recordings) if np.isfinite(one).any()]
-    log = [frames for i in numbers if (frames := complete(recordings[i], reference)) is not None]
+    log = complete([recordings[i] for i in numbers], reference.scale.baseline)
     if min(len(log), len(usual)) < FEWEST:
         return None
-    used = layout.present.ravel() & (reference.dead == 0) & ~excluded
+    used = layout.is_cell & (reference.dead == 0) & ~excluded
     fit = Fit.of(reference, layout, used, usual)
     both = _Readings.of([*usual, *log], len(usual), fit)
     pads = [_Pad.of(both, on, len(usual), fit) for on in fit.pads if (on & used).any()]

@@ -108,7 +108,7 @@ def _floors(
     above = evenly(recordings) - rest
     lowest = known_quantile(above, RARE, axis=0)
     near = SLIGHT * layout.full_scale
-    telling = layout.present.ravel() & (np.fmax.reduce(above) - lowest > near) & (lowest < near)
+    telling = layout.is_cell & (np.fmax.reduce(above) - lowest > near) & (lowest < near)
     grid = layout.grid(np.where(telling, above, np.nan))
     for pad in range(layout.pads):
         idle = np.nan_to_num(grid[:, pad]).max(axis=(1, 2)) < LIGHT * layout.full_scale

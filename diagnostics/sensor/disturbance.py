@@ -109,7 +109,7 @@ def find_sentinel(recordings: Recordings, layout: SensorLayout) -> Disturbance |
     counts: Counter[float] = Counter()
     readings = 0
     for frames in recordings:
-        given = np.asarray(frames, dtype=np.float64)[:, layout.present.ravel()]
+        given = np.asarray(frames, dtype=np.float64)[:, layout.is_cell]
         readings += given.size
         outside = invalid(given, layout.full_scale)
         if outside is not None:
@@ -132,7 +132,7 @@ def rest_of(reference: Recordings, layout: SensorLayout) -> Floats:
     """Return the reading of each cell without contact, ``[D]``: the median over recordings of its
     low quantile."""
     lows = np.stack([known_quantile(frames, LOW, axis=0) for frames in reference])
-    return np.where(layout.present.ravel(), known_quantile(lows, 0.5, axis=0), np.nan)
+    return np.where(layout.is_cell, known_quantile(lows, 0.5, axis=0), np.nan)
 
 
 def extremes_of(recordings: Recordings) -> tuple[Floats, Floats]:
@@ -147,7 +147,7 @@ def _moving_cells(recordings: Recordings, layout: SensorLayout) -> tuple[NDArray
     """Return the cells whose readings differ, bool ``[D]``, and the highest reading of each,
     ``[D]``."""
     low, high = extremes_of(recordings)
-    return layout.present.ravel() & (high - low > SLIGHT * layout.full_scale), high
+    return layout.is_cell & (high - low > SLIGHT * layout.full_scale), high
 
 
 def _differs(new: Floats, old: Floats) -> bool:
@@ -182,7 +182,7 @@ def _deviation(frames: Floats, layout: SensorLayout) -> float:
     frames."""
     if len(frames) < 8:
         return np.nan
-    curvature = np.abs(np.diff(frames[:, layout.present.ravel()], 2, axis=0))
+    curvature = np.abs(np.diff(frames[:, layout.is_cell], 2, axis=0))
     received = ~np.isnan(curvature).all(axis=0)
     if not received.any():
         return np.nan
@@ -192,7 +192,7 @@ def _deviation(frames: Floats, layout: SensorLayout) -> float:
 def _step(recordings: Recordings, layout: SensorLayout) -> float:
     """Return the smallest difference of two readings; 0 without any."""
     sample = np.concatenate([frames[:: max(1, len(frames) // 20)] for frames in recordings])
-    values = np.unique(sample[:, layout.present.ravel()])
+    values = np.unique(sample[:, layout.is_cell])
     gaps = np.diff(values[np.isfinite(values)])
     gaps = gaps[gaps > 1e-9 * layout.full_scale]
     return float(np.quantile(gaps, LOW)) if len(gaps) else 0.0
@@ -243,7 +243,7 @@ def _share_at(frames: Floats, level: float, loaded_from: Floats) -> float:
 
 
 def _normalised(recordings: Recordings, layout: SensorLayout) -> Disturbance | None:
-    every = np.concatenate(recordings)[:, layout.present.ravel()]
+    every = np.concatenate(recordings)[:, layout.is_cell]
     lowest = np.nanmin(every)
     highest = np.nanmax(every)
     if not highest > lowest or every.shape[1] < 3:
@@ -266,7 +266,7 @@ def _normalised(recordings: Recordings, layout: SensorLayout) -> Disturbance | N
 def _silent(
     recordings: Recordings, reference: Recordings, layout: SensorLayout
 ) -> Disturbance | None:
-    present = layout.present.ravel()
+    present = layout.is_cell
 
     def changes(frames: Floats) -> bool:
         given = frames[:, present]

@@ -81,7 +81,7 @@ def find_odd_frames(
     """
     if not recordings:
         return ()
-    present = layout.present.ravel()
+    present = layout.is_cell
     usual = _Usual.of(recordings, present)
     if usual is None:
         return ()
@@ -128,7 +128,7 @@ def _candidates(
 ) -> Iterator[tuple[int, Floats, Floats, Floats]]:
     """Yield the frames of a recording in which a quarter of the cells of a pad jump: number, jumps,
     their sizes and readings, ``[D]`` each."""
-    present = layout.present.ravel()
+    present = layout.is_cell
     of_pad = np.bincount(layout.pad_of[present], minlength=layout.pads)
     enough = np.maximum(_FEWEST, LEAST_LOADED * of_pad)
     step = max(4 * _NEAR, _BLOCK // len(present))
@@ -269,7 +269,7 @@ class _Test:
         loaded = np.abs(sample - self._rest) > usual.least
         if loaded.sum(axis=1).max() < _ENOUGH:  # one load throughout counts as no rest
             self._rest = np.full_like(self._rest, np.nanmin(self._rest))
-        self._present = layout.present.ravel()
+        self._present = layout.is_cell
         self._sample = sample
         self._highest = float(np.nanmax(sample[:, self._present]))
         self._least_of: dict[bytes, float] = {}

@@ -56,7 +56,7 @@ def find_one_signal(sample: Floats, layout: SensorLayout) -> tuple[OneSignal, ..
         sample: frames of a log, ``[n, D]``, in the layout's unit; NaN = missing.
         layout: the array.
     """
-    present = layout.present.ravel()
+    present = layout.is_cell
     least = LIGHT * layout.full_scale
     every = np.flatnonzero(present)
     step = "the select lines / the multiplexer do not step"
@@ -86,7 +86,7 @@ def _lines(layout: SensorLayout, pad: int) -> Iterator[tuple[list[Cells], str, s
     """Yield the rows of a pad, and its columns, with their names and those of the others."""
     if not layout.is_matrix:
         return
-    cells = layout.grid(np.where(layout.present.ravel(), np.arange(layout.n_cells), -1))[pad]
+    cells = layout.grid(np.where(layout.is_cell, np.arange(layout.n_cells), -1))[pad]
     if min(cells.shape) < 2:
         return
     for of_lines, kind, other in ((cells, "row", "column"), (cells.T, "column", "row")):

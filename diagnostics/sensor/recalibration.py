@@ -38,7 +38,7 @@ from scipy.special import gammaincinv, ndtri
 from diagnostics.evidence.prediction import OUTLIERS, log_student_t
 from diagnostics.model.symbols import NOTHING, root_load
 from diagnostics.preprocessing.levels import FEWEST, LOW, SLIGHT
-from diagnostics.preprocessing.readings import held
+from diagnostics.preprocessing.readings import complete
 from diagnostics.sensor.gain import GAIN
 
 if TYPE_CHECKING:
@@ -133,9 +133,9 @@ def find_recalibration(
             other cells read otherwise too.
         rival: the recordings with wires put back, which must not explain the log better.
     """
-    used = layout.present.ravel() & ~excluded & (reference.dead == 0)
-    new = [filled for r in recordings if (filled := complete(r, reference)) is not None]
-    old = [filled for r in healthy if (filled := complete(r, reference)) is not None]
+    used = layout.is_cell & ~excluded & (reference.dead == 0)
+    new = complete(recordings, reference.scale.baseline)
+    old = complete(healthy, reference.scale.baseline)
     if reference.model is None or len(new) < _FEWEST or len(old) < _FEWEST:
         return None
     fit = Fit.of(reference, layout, used, old)
@@ -145,31 +145,18 @@ def find_recalibration(
     if not differing:
         return None
     clear = [on & ~statically_loaded for on in differing]
-    # of pseudo-likelihood in each recording, [recordings, with gains or without, differing pads]
-    gains = []
-    for (log_gain, offset), other in zip(of_halves, halves[::-1], strict=True):
-        plain = fit.scores(other, 0 * log_gain, 0 * offset)
-        gains.append(
-            [
-                [fit.scores(other, s * log_gain * on, offset * on) - plain for on in clear]
-                for s in (1, 0)
-            ]
-        )
-    gained = np.concatenate(gains, axis=2)
-    # in order of time: the first half was learned from the even recordings, and scored the others
-    gained = gained[..., np.argsort(np.r_[1 : len(new) : 2, : len(new) : 2])]
+    gained = fit.gained(halves, of_halves, clear)
     best = gained.mean(axis=2).argmax(axis=0)
     certain = [i for i in range(len(differing)) if mean_is_positive(gained[best[i], i])]
-    if not certain:
+    pads = [differing[i] for i in certain]
+    if not pads or (rival is not None and fit.prefers(rival, halves, of_halves, pads)):
         return None
     log_gain, offset = fit.learned(new)
     gain = np.ones_like(log_gain)
     rest = fit.model.symbols.rest.level
-    if rival is not None and fit.prefers(rival, halves, of_halves, [differing[i] for i in certain]):
-        return None
+    moved = np.zeros_like(offset)
     replaced = []
     throughout = True
-    moved = np.zeros_like(offset)
     for i in certain:
         on = differing[i]
         _, errors = _correlation(offset, clear[i], layout)
@@ -269,7 +256,7 @@ class Fit:
     @property
     def pads(self) -> list[Mask]:
         """The cells of each pad, bool ``[D]``."""
-        present = self.layout.present.ravel()
+        present = self.layout.is_cell
         return [(self.layout.pad_of == i) & present for i in range(self.layout.pads)]
 
     def differ(self, on: Mask, one: Learned, other: Learned) -> bool:
@@ -283,6 +270,23 @@ class Fit:
         slight = SLIGHT * self.model.symbols.rest.full
         return bool(by_gain >= np.log(GAIN) / 2 or by_offset >= slight / 2)
 
+    def gained(
+        self, halves: Sequence[Sequence[Floats]], of_halves: Sequence[Learned], pads: Sequence[Mask]
+    ) -> Floats:
+        """Return how much more likely each recording is with the gains and offsets of a pad, or its
+        offsets alone, that were learned from the other half: ``[2, pads, recordings]``, in order of
+        time."""
+        gains = []
+        for (log_gain, offset), other in zip(of_halves, halves[::-1], strict=True):
+            plain = self.scores(other, 0 * log_gain, 0 * offset)
+            both = [
+                [self.scores(other, s * log_gain * on, offset * on) for on in pads] for s in (1, 0)
+            ]
+            gains.append(np.array(both) - plain)
+        # the first half was learned from the even recordings, and scored the others
+        n = sum(map(len, halves))
+        return np.concatenate(gains, axis=2)[..., np.argsort(np.r_[1:n:2, :n:2])]
+
     def prefers(
         self,
         rival: Sequence[NDArray[Any]],
@@ -295,12 +299,12 @@ class Fit:
 
         Cells that count as faulty are scored too: wires that are exchanged make them so.
         """
-        everywhere = replace(self, used=self.layout.present.ravel() & self.model.living)
+        everywhere = replace(self, used=self.layout.is_cell & self.model.living)
         on = np.any(pads, axis=0)
         ours = 0.0
         for (log_gain, offset), other in zip(of_halves, halves[::-1], strict=True):
             ours += everywhere.scores(other, log_gain * on, offset * on).sum()
-        put_back = [one for r in rival if (one := complete(r, self.reference)) is not None]
+        put_back = complete(rival, self.reference.scale.baseline)
         nothing = np.zeros(self.layout.n_cells)
         return bool(everywhere.scores(put_back, nothing, nothing).sum() > ours)
 
@@ -434,12 +438,3 @@ def noise_of(recordings: Sequence[Floats]) -> Floats:
     least = np.sqrt(2 * gammaincinv((FEWEST - 1) / 2, LOW) / FEWEST)
     noise: Floats = np.quantile(spreads, LOW, axis=0) / least
     return noise
-
-
-def complete(recording: NDArray[Any], reference: Reference) -> Floats | None:
-    """Return a recording with the last reading where one is missing; None without any reading."""
-    frames = np.asarray(recording, dtype=np.float64)
-    if not np.isfinite(frames).any():
-        return None
-    known: Floats = held(frames, np.full(frames.shape[1], np.nan))[1:]
-    return np.where(np.isnan(known), reference.scale.baseline, known)

@@ -94,7 +94,7 @@ def find_repeated_frames(
 ) -> RepeatedFrames | None:
     """Return how a log, ``[T, D]`` each, repeats frames; None where most frames are new, or hardly
     anything changes."""
-    present = layout.present.ravel()
+    present = layout.is_cell
     step = max(1, len(recordings) // _RECORDINGS)
     some = [np.asarray(frames)[:_FRAMES, present] for frames in recordings[::step]]
     counted = [Repetitions.of(frames) for frames in some if len(frames)]

@@ -37,10 +37,9 @@ converter, or one that loads drive to its top.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import combinations
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -49,6 +48,7 @@ from scipy.special import expit
 
 from diagnostics.model.symbols import NOTHING, root_load
 from diagnostics.preprocessing.levels import CERTAIN_RATIO, MAJORITY
+from diagnostics.sensor.permutations import best_of, candidates_of
 from diagnostics.sensor.recalibration import mean_is_positive
 
 if TYPE_CHECKING:
@@ -63,10 +63,6 @@ _THE_SAME = 0.95  # cosine from which on two pieces load the same cells
 _PRIOR = 2.0  # pieces that a usual level is worth
 _IMPOSSIBLE = 0.002
 _STEEP = 1.8  # logistic distribution of deviation 1
-# of one kind on a pad, the least expected, whose exchange is tried; on large arrays: sizes
-_LINES = 16
-_FEW_LINES = 4
-_WORK = 6400  # lines times cells, about: a size
 LIMIT = 2 * CERTAIN_RATIO  # log likelihood gained, all pieces together
 _ERRORS = 2.5  # standard errors by which the gain of a piece exceeds 0
 # of what a random order of a pad loses: gained where a whole pad is turned; by chance up to 0.03
@@ -107,15 +103,6 @@ class Rewiring:
         return frames[..., self.source]
 
 
-class _Candidate(NamedTuple):
-    """A permutation that is tried; ``turned``: of a whole pad, so that symmetric loads hardly tell
-    it."""
-
-    source: Cells
-    text: str
-    turned: bool = False
-
-
 def find_rewiring(
     recordings: Sequence[NDArray[np.float64]],
     reference: Reference,
@@ -129,22 +116,11 @@ def find_rewiring(
         reference: of the array, fitted.
         layout: the array.
     """
-    if reference.model is None:
+    test = Test.of(recordings, reference, layout)
+    if test is None:
         return None
-    log = reference.model.log_of_record(reference.model.record_of(recordings))
-    if log.is_coarse:
-        return None
-    whole = np.zeros(layout.n_cells, np.intp)
-    pieces, weight = strongest(log, np.arange(len(log.record)), _PIECES, whole)
-    if len(pieces) < _FEWEST:
-        return None
-    test = Test(reference.model, log, pieces, weight)
     source = np.arange(layout.n_cells)
     anywhere = np.random.default_rng(0).permutation(layout.n_cells)
-
-    def at_random(faulty: Mask) -> float:
-        return float(test.score(anywhere, faulty).by_piece.sum())
-
     total = 0.0
     steps: list[str] = []
     now = test.settled(source, test.score(source, ~test.used))
@@ -159,8 +135,9 @@ def find_rewiring(
         sums = np.array([score.by_piece.sum() for score in scores])
         working = ~scores[int(sums.argmax())].faulty
         sums += [score.usual[working].sum() for score in scores]
-        best = int(sums.argmax())
-        found = test.settled(candidates[best].source, scores[best])
+        i, lead = best_of(candidates, sums, source)
+        best = candidates[i]
+        found = test.settled(best.source, scores[i])
         # The present order may be as good once the channels that are faulty in the other one are
         # left out.
         again = test.settled(source, test.score(source, found.faulty))
@@ -168,29 +145,15 @@ def find_rewiring(
             now = again
             continue
         gain = found.by_piece - now.by_piece
-        # Where it was exchanged, two lines elsewhere may be exchanged as well.
-        moves = candidates[best].source != source
-        rivals = [
-            sums[i]
-            for i, of in enumerate(candidates)
-            if i != best and (moves & (of.source != source)).any()
-        ]
-        if not _certain(gain) or sums[best] - max(rivals, default=-np.inf) < LIMIT / 2:
+        if lead < LIMIT / 2 or not test.proves(gain, best.source, source, found.faulty):
             break
-        if (
-            candidates[best].turned
-            and gain.sum() < _TURNED * (sums[best] - at_random(found.faulty)) / layout.pads
-        ):
-            break
-        # The channels that work say so by themselves: no permutation is due to the faulty ones.
-        of_working = test.of_working(candidates[best].source, found.faulty) - test.of_working(
-            source, found.faulty
-        )
-        if not _certain(of_working):
-            break
-        source = candidates[best].source
+        if best.turned:
+            lost = sums[i] - float(test.score(anywhere, found.faulty).by_piece.sum())
+            if gain.sum() < _TURNED * lost / layout.pads:
+                break
+        source = best.source
         total += float(gain.sum())
-        steps.append(candidates[best].text)
+        steps.append(best.text)
         now = found
     if not steps:
         return None
@@ -246,6 +209,19 @@ class Test:
     log: Log
     pieces: Cells
     weight: Floats
+
+    @classmethod
+    def of(
+        cls, recordings: Sequence[Floats], reference: Reference, layout: SensorLayout
+    ) -> Test | None:
+        """Return the test on the pieces that load a log most; None where the data do not tell."""
+        model = reference.model
+        log = None if model is None else model.log_of_record(model.record_of(recordings))
+        if model is None or log is None or log.is_coarse:
+            return None
+        whole = np.zeros(layout.n_cells, np.intp)
+        pieces, weight = strongest(log, np.arange(len(log.record)), _PIECES, whole)
+        return None if len(pieces) < _FEWEST else cls(model, log, pieces, weight)
 
     @cached_property
     def used(self) -> Mask:
@@ -303,6 +279,13 @@ class Test:
             telling = self.model.living & self.log.received[source]
             self._offsets[key] = rest.shared(put_back, telling).offset
         return self._offsets[key]
+
+    def proves(self, gain: Floats, source: Cells, before: Cells, faulty: Mask) -> bool:
+        """Return whether the ``gain [n]`` of the pieces proves a permutation, not by a few of them,
+        and the channels that work say so by themselves: none is due to the ``faulty`` ones."""
+        if not _certain(gain):
+            return False
+        return _certain(self.of_working(source, faulty) - self.of_working(before, faulty))
 
     def settled(self, source: Cells, score: _Score) -> _Score:
         """Return the score of one permutation once its faulty channels are no predictors;
@@ -398,63 +381,3 @@ def strongest(log: Log, some: Cells, most: int, pad_of: Cells) -> tuple[Cells, F
     unit = load[chosen] / np.linalg.norm(load[chosen], axis=1, keepdims=True)
     repeats = np.tril(unit @ unit.T >= _THE_SAME, -1).sum(axis=1)
     return some[chosen], 1 / (1 + repeats)
-
-
-def candidates_of(layout: SensorLayout, surplus: Floats, source: Cells) -> Iterator[_Candidate]:
-    """Yield the permutations that are tried, each on top of ``source``; with declared wiring only
-    exchanged pads."""
-    grid, score = layout.grid(np.arange(layout.n_cells)), layout.grid(surplus)
-    # fewer on large arrays, where each costs more
-    most = int(np.clip(_WORK // layout.n_cells, _FEW_LINES, _LINES))
-    for pad in range(layout.pads) if layout.is_matrix else ():
-        for axis, kind in enumerate(("row", "column")):
-            size = grid.shape[axis + 1]
-            worst = np.sort(np.argsort(score[pad].sum(axis=1 - axis))[:most]).tolist()
-            orders = [
-                (_exchanged(size, a, b), f"{kind}s {a} and {b} of pad {pad} are exchanged")
-                for a, b in combinations(worst, 2)
-            ]
-            if size > 2:
-                orders.append(
-                    (np.arange(size)[::-1], f"the {kind}s of pad {pad} are in reverse order")
-                )
-            if size > 3:
-                for by in (1, -1):
-                    orders.append(
-                        (
-                            np.roll(np.arange(size), -by),
-                            f"the {kind}s of pad {pad} are shifted by {by:+d}",
-                        )
-                    )
-            for order, text in orders:
-                changed = grid.copy()
-                changed[pad] = np.take(grid[pad], order, axis=axis)
-                yield _Candidate(source[changed.ravel()], text, turned="reverse" in text)
-        for order, text in _orientations(*grid[pad].shape):
-            changed = grid.copy()
-            changed[pad] = grid[pad].ravel()[order]
-            yield _Candidate(source[changed.ravel()], f"pad {pad} is {text}", turned=True)
-    for a, b in combinations(range(layout.pads), 2):
-        yield _Candidate(
-            source[grid[_exchanged(layout.pads, a, b)].ravel()], f"pads {a} and {b} are exchanged"
-        )
-
-
-def _orientations(rows: int, columns: int) -> Iterator[tuple[NDArray[np.intp], str]]:
-    """Yield the orders of a pad that is turned or read in the other order, ``[rows, columns]``, and
-    their names."""
-    if min(rows, columns) < 2:
-        return
-    by_column = np.arange(rows * columns).reshape(columns, rows).T
-    yield by_column, "transposed: read column by column"
-    yield by_column[::-1], "transposed: read column by column, the rows in reverse order"
-    yield by_column[:, ::-1], "transposed: read column by column, the columns in reverse order"
-    yield by_column[::-1, ::-1], "transposed: read column by column, both in reverse order"
-    yield np.arange(rows * columns)[::-1].reshape(rows, columns), "turned by half a turn"
-
-
-def _exchanged(size: int, a: int, b: int) -> NDArray[np.intp]:
-    """Return the order of ``size`` lines or pads with two of them exchanged."""
-    order = np.arange(size)
-    order[[a, b]] = b, a
-    return order

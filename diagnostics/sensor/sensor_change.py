@@ -72,7 +72,7 @@ def find_change(
 ) -> SensorChange | None:
     """Return the change of a pad, else of the whole sensor; None where none is found. ``faulty``
     cells do not count."""
-    healthy = np.flatnonzero(layout.present.ravel() & ~faulty.mask)
+    healthy = np.flatnonzero(layout.is_cell & ~faulty.mask)
     if not len(healthy):
         return None
     compared = recordings, reference, layout, healthy

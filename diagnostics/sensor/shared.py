@@ -54,7 +54,7 @@ class Shared:
     def of(cls, log: RecordingBlocks, layout: SensorLayout) -> Shared:
         """Return what the array does in a log, ``[T, D]`` each, in the layout's unit."""
         recordings = log.given
-        valid = log.valid(layout.full_scale, layout.present.ravel())
+        valid = log.valid(layout.full_scale, layout.is_cell)
         groups = find_one_signal(evenly(valid.given), layout)
         cells = [cell for group in groups for cell in group.cells]
         if cells:
@@ -89,7 +89,7 @@ class Shared:
     @property
     def explains_all(self) -> bool:
         """Whether no cell is left to judge."""
-        return bool(self.mask[self.layout.present.ravel()].all())
+        return bool(self.mask[self.layout.is_cell].all())
 
     def diagnosis(self) -> Diagnosis:
         """Return the diagnosis of a log in which no cell is left to judge."""

@@ -24,7 +24,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from diagnostics.preprocessing.levels import CERTAIN_RATIO, LEAST_LOADED, MAJORITY
-from diagnostics.sensor.rewiring import LIMIT, Rewiring, Test, candidates_of, strongest
+from diagnostics.sensor.permutations import best_of, candidates_of
+from diagnostics.sensor.rewiring import LIMIT, Rewiring, Test, strongest
 
 if TYPE_CHECKING:
     from diagnostics.evidence.reference import Reference
@@ -104,7 +105,7 @@ def find_swapped_in_part(
     gains = np.stack([scored.likely(one.source) - usual for one in candidates])
     exchanged = gains >= LIMIT
     totals = np.where(exchanged, gains, 0.0).sum(axis=1)
-    best = int(totals.argmax())
+    best, lead = best_of(candidates, totals, as_they_came, 0.0)
     of_pads = (layout.pad_of[candidates[best].source] != layout.pad_of).any()
     # A connector may be wrong for one recording; the lines of a pad are not.
     if totals[best] < _PROVEN or (exchanged[best].sum() < 2 and not of_pads):
@@ -113,13 +114,7 @@ def find_swapped_in_part(
     others = ~which & np.isfinite(usual)
     if not (gains[best] <= -LIMIT).any():  # it may be so throughout
         return None
-    moves = candidates[best].source != as_they_came
-    rivals = [
-        total
-        for i, total in enumerate(totals)
-        if i != best and (moves & (candidates[i].source != as_they_came)).any()
-    ]
-    if totals[best] - max(rivals, default=0.0) < LIMIT / 2:
+    if lead < LIMIT / 2:
         return None
     low, middle = np.quantile(usual[others], [LEAST_LOADED, MAJORITY])
     if np.median((usual + gains[best])[which]) < min(low, middle - LIMIT):

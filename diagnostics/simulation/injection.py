@@ -18,17 +18,25 @@ from diagnostics.layout import SensorLayout
 from diagnostics.preprocessing.levels import LIGHT
 from diagnostics.wiring import Line
 
-# Defaults of ``Fault.value`` and thresholds, as shares of full scale.
-_NOISE = 0.05  # NOISY: standard deviation of the added noise
-_DRIFT = 0.01  # DRIFT: offset gained per second
-_SWING = 0.2  # FLOATING: range of the movement
-_CLAMP = 0.1  # CLAMPED: highest reading
+# Defaults of ``Fault.value``, as shares of full scale, and as they are.
+_SHARES = {
+    FaultKind.SHORT: 1.0,
+    FaultKind.NOISY: 0.05,  # standard deviation of the added noise
+    FaultKind.DRIFT: 0.01,  # offset gained per second
+    FaultKind.FLOATING: 0.2,  # range of the movement
+    FaultKind.CLAMPED: 0.1,  # highest reading
+}
+_NUMBERS = {
+    FaultKind.LATE: 10,  # frames
+    FaultKind.WEAK: 0.35,  # share of the load that is left
+}
 _PERIODS = (12.0, 100.0)  # FLOATING: frames of one swing, drawn between these
-_DELAY = 10  # LATE: frames
-_WEAK = 0.35  # WEAK: share of the load that is left
 # INTERMITTENT: probability per frame that a closed contact opens, and that an open one closes.
 _OPENS = 0.2
 _CLOSES = 0.4
+
+Cells = NDArray[np.intp]
+Floats = NDArray[np.float64]
 
 
 def inject(
@@ -40,7 +48,7 @@ def inject(
     dither: float = 0.0,
     until: int | None = None,
     gain: float = 0.0,
-) -> NDArray[np.float64]:
+) -> Floats:
     """Return a copy of ``recording`` with ``faults`` injected, each from its onset on.
 
     Faults are applied in order; every one reads the healthy recording, so an alias copies what the
@@ -91,81 +99,71 @@ def inject(
 
 def _faulty_readings(
     fault: Fault,
-    cells: NDArray[np.intp],
-    healthy: NDArray[np.float64],  # [t, D], while the fault lasts
+    cells: Cells,
+    healthy: Floats,  # [t, D], while the fault lasts
     layout: SensorLayout,
     rng: np.random.Generator,
     dither: float,
     gain: float,
-) -> NDArray[np.float64]:
+) -> Floats:
     """Return what ``cells`` read under ``fault``, ``[t, len(cells)]``."""
     own = healthy[:, cells]
     full_scale = layout.full_scale
+    value = fault.value
+    if value is None:
+        value = _SHARES.get(fault.kind, 0.0) * full_scale + _NUMBERS.get(fault.kind, 0.0)
     match fault.kind:
         case FaultKind.OPEN | FaultKind.SHORT | FaultKind.STUCK:
-            value = fault.value
-            if value is None:
-                if fault.kind is FaultKind.STUCK:
-                    raise ValueError("a STUCK fault needs a value: what do its cells read?")
-                value = full_scale if fault.kind is FaultKind.SHORT else 0.0
+            if fault.kind is FaultKind.STUCK and fault.value is None:
+                raise ValueError("a STUCK fault needs a value: what do its cells read?")
             return value + dither * full_scale * rng.uniform(-1.0, 1.0, own.shape)
         case FaultKind.ALIAS:
             partners = _bridge_partners(fault, cells, layout)
             sources = _alias_sources(fault, cells, layout) if partners is None else partners
             # Where nothing is connected, no current flows.
-            others: NDArray[np.float64] = np.where(
-                sources >= 0, healthy[:, np.maximum(sources, 0)], 0.0
-            )
+            others: Floats = np.where(sources >= 0, healthy[:, np.maximum(sources, 0)], 0.0)
             # Two cells in parallel: their conductances add, and so do their forces.
             return others if partners is None else own + others
         case FaultKind.INTERMITTENT:
             # One contact serves all the cells of the fault: they blink together, each only while it
             # is loaded.
             closed = _blinking(len(own), rng)[:, None]
-            return np.where(closed | ~(own > LIGHT * full_scale), own, fault.value or 0.0)
+            return np.where(closed | ~(own > LIGHT * full_scale), own, value)
         case FaultKind.NOISY:
-            sigma = _NOISE * full_scale if fault.value is None else fault.value
-            return own + rng.normal(0.0, sigma, own.shape)
+            return own + rng.normal(0.0, value, own.shape)
         case FaultKind.DRIFT:
-            rate = _DRIFT * full_scale if fault.value is None else fault.value
             frames = np.arange(1, len(own) + 1)[:, None]
-            drifted: NDArray[np.float64] = (
-                own * (1.0 + gain / layout.rate * frames) + rate / layout.rate * frames
+            drifted: Floats = (
+                own * (1.0 + gain / layout.rate * frames) + value / layout.rate * frames
             )
             return drifted
         case FaultKind.FLOATING:
-            swing = _SWING * full_scale if fault.value is None else fault.value
-            floating: NDArray[np.float64] = np.fmin.reduce(own, initial=np.inf) + swing * _swinging(
-                own.shape, rng
-            )
+            swing = value * _swinging(own.shape, rng)
+            floating: Floats = np.fmin.reduce(own, initial=np.inf) + swing
             return floating
         case FaultKind.LATE:
-            delay = _DELAY if fault.value is None else int(fault.value)
-            return own[np.maximum(np.arange(len(own)) - delay, 0)]
+            return own[np.maximum(np.arange(len(own)) - int(value), 0)]
         case FaultKind.COPY:
             return _copied(fault, cells, healthy, layout)
         case FaultKind.CLAMPED:
-            return np.minimum(own, _CLAMP * full_scale if fault.value is None else fault.value)
+            return np.minimum(own, value)
         case FaultKind.WEAK:
-            share = _WEAK if fault.value is None else fault.value
             lowest = np.fmin.reduce(own, initial=np.inf)
-            weakened: NDArray[np.float64] = lowest + share * (own - lowest)
+            weakened: Floats = lowest + value * (own - lowest)
             return weakened
 
 
-def _swinging(shape: tuple[int, ...], rng: np.random.Generator) -> NDArray[np.float64]:
+def _swinging(shape: tuple[int, ...], rng: np.random.Generator) -> Floats:
     """Return a sine from 0 to 1 for each cell, ``[t, cells]``, each with a period and a phase of
     its own."""
     period = rng.uniform(*_PERIODS, shape[1])
     phase = rng.uniform(0.0, 1.0, shape[1])
     turns = np.arange(shape[0])[:, None] / period + phase
-    swing: NDArray[np.float64] = (1.0 + np.sin(2 * np.pi * turns)) / 2
+    swing: Floats = (1.0 + np.sin(2 * np.pi * turns)) / 2
     return swing
 
 
-def _copied(
-    fault: Fault, cells: NDArray[np.intp], healthy: NDArray[np.float64], layout: SensorLayout
-) -> NDArray[np.float64]:
+def _copied(fault: Fault, cells: Cells, healthy: Floats, layout: SensorLayout) -> Floats:
     """Return what the cells of a COPY fault read, ``[t, cells]``."""
     if fault.value is not None:
         # IndexError names a cell that is not there
@@ -180,7 +178,7 @@ def _copied(
     return copied
 
 
-def _alias_sources(fault: Fault, cells: NDArray[np.intp], layout: SensorLayout) -> NDArray[np.intp]:
+def _alias_sources(fault: Fault, cells: Cells, layout: SensorLayout) -> Cells:
     """Return the cell that each of ``cells`` reads instead of itself; -1: an address with nothing
     connected."""
     line = fault.line
@@ -202,9 +200,7 @@ def _alias_sources(fault: Fault, cells: NDArray[np.intp], layout: SensorLayout) 
     return np.array([layout.cell(pad, row, value) for pad, row, _ in positions])
 
 
-def _bridge_partners(
-    fault: Fault, cells: NDArray[np.intp], layout: SensorLayout
-) -> NDArray[np.intp] | None:
+def _bridge_partners(fault: Fault, cells: Cells, layout: SensorLayout) -> Cells | None:
     """Return the cell that each of ``cells`` is bridged with; -1: an absent one. None: the alias is
     not a bridge.
 
@@ -223,7 +219,7 @@ def _bridge_partners(
         return None
     step = (index - line.index) * (layout.cols if line.kind == "row" else 1)
     partners = np.where(np.isin(cells, list(theirs)), cells - step, cells + step)
-    return np.where(layout.present.ravel()[partners], partners, -1)
+    return np.where(layout.is_cell[partners], partners, -1)
 
 
 def _blinking(frames: int, rng: np.random.Generator) -> NDArray[np.bool_]:
@@ -289,7 +285,7 @@ def line_fault(
 
 def _beyond(
     layout: SensorLayout, line: Line, kind: FaultKind, break_at: int, driven_from: str
-) -> tuple[NDArray[np.intp], str]:
+) -> tuple[Cells, str]:
     """Return the cells behind a break, and where these are, as text."""
     if line.kind not in ("row", "column"):
         raise ValueError(f"break_at is a position along a row or column; {line} has no positions")
@@ -351,9 +347,7 @@ def bridge(layout: SensorLayout, line: Line, *, onset: int | None = None) -> Fau
     )
 
 
-def freeze_stream(
-    recording: ArrayLike, onset: int, until: int | None = None
-) -> NDArray[np.float64]:
+def freeze_stream(recording: ArrayLike, onset: int, until: int | None = None) -> Floats:
     """Return a copy of ``recording`` ``[T, ...]`` that repeats frame ``onset`` to its end, or
     before frame ``until``.
 
@@ -369,9 +363,7 @@ def freeze_stream(
     return out
 
 
-def lose_frames(
-    recording: ArrayLike, share: float, *, seed: int | None = None
-) -> NDArray[np.float64]:
+def lose_frames(recording: ArrayLike, share: float, *, seed: int | None = None) -> Floats:
     """Return a copy of ``recording`` ``[T, ...]`` in which randomly chosen frames are missing: all
     NaN.
 

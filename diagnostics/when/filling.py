@@ -45,7 +45,7 @@ def filled(recordings: RecordingBlocks, held: Held, layout: SensorLayout) -> Rec
 def _around(cells: NDArray[np.intp], held: Held, layout: SensorLayout) -> NDArray[np.intp]:
     """Return the cells nearest to some on the same pad that are never suspect."""
     places = np.array([layout.position(cell)[:3] for cell in range(layout.n_cells)])
-    usable = layout.present.ravel() & ~held.suspect.any(axis=0)
+    usable = layout.is_cell & ~held.suspect.any(axis=0)
     usable &= np.isin(layout.pad_of, layout.pad_of[cells])
     away = np.abs(places[:, None] - places[cells]).sum(axis=2).min(axis=1)
     nearest = np.argsort(np.where(usable, away, np.inf), kind="stable")[:_AROUND]

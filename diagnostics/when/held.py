@@ -139,7 +139,7 @@ class _Search:
             orders.append(np.argsort(classes, kind="stable"))
         self._spans = spans
         self._tolerance = tolerance
-        self._known = spans.known & layout.present.ravel()
+        self._known = spans.known & layout.is_cell
         nothing = Held.nothing(spans, tolerance)
         self._nothing = nothing
         self._moved = nothing.moved
@@ -147,8 +147,7 @@ class _Search:
         self._moves = np.sqrt(moves)
         self._exact = self._known & (spans.ranges <= 0)
         self._symbol = self._symbols(layout)
-        self._beside = np.where(layout.present.ravel()[layout.beside], layout.beside, -1)
-        self._beside[layout.beside < 0] = -1
+        self._beside = layout.beside
         self._on, self._near = _lines(layout)
         self._cells = Mixture(self._symbol, _CONTEXTS, orders, classes)
         self._lines = Mixture(self._line_symbols(), _CONTEXTS, orders)
@@ -312,19 +311,17 @@ def _lines(layout: SensorLayout) -> tuple[Floats, Floats]:
 
     Lines of few cells, and of most cells of the array, say nothing that their cells do not.
     """
-    present = layout.present.ravel()
     on: list[Floats] = []
     near: list[Floats] = []
     for line in layout.lines:
         mine = np.zeros(layout.n_cells)
         mine[layout.cells_on(line)] = 1.0
-        mine *= present
-        if not _FEWEST_ON_LINE <= mine.sum() < MAJORITY * present.sum():
+        if not _FEWEST_ON_LINE <= mine.sum() < MAJORITY * layout.is_cell.sum():
             continue
         others = layout.beside[mine > 0].ravel()
         next_to = np.zeros(layout.n_cells)
         next_to[others[others >= 0]] = 1.0
-        next_to *= (1 - mine) * present
+        next_to *= 1 - mine
         if next_to.any():
             on.append(mine)
             near.append(next_to)

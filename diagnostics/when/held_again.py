@@ -46,7 +46,7 @@ def held_again(spans: Spans, layout: SensorLayout) -> Bools:
     """
     low = spans.low
     high = spans.high
-    known = spans.known & layout.present.ravel()
+    known = spans.known & layout.is_cell
     if not known.any():
         return np.zeros(low.shape, bool)
     rest = _rest(low, high, known)

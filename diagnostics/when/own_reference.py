@@ -74,8 +74,8 @@ def reads_enough(ranges: NDArray[np.float64], layout: SensorLayout) -> NDArray[n
         ranges: highest minus lowest reading of each cell, ``[D]``.
         layout: the array.
     """
-    on = (layout.beside >= 0) & layout.present.ravel()[layout.beside]
-    beside = known_quantile(np.where(on, ranges[layout.beside], np.nan), MAJORITY, axis=1)
+    around = np.where(layout.beside >= 0, ranges[layout.beside], np.nan)
+    beside = known_quantile(around, MAJORITY, axis=1)
     # where there are none, nothing contradicts
     found: NDArray[np.bool_] = ranges >= MAJORITY * np.nan_to_num(beside)
     return found

@@ -69,11 +69,9 @@ def _places(cells: NDArray[np.intp], layout: SensorLayout) -> str:
     """Return the lines and the other cells in words."""
     left = np.zeros(layout.n_cells, bool)
     left[cells] = True
-    present = layout.present.ravel()
     places = []
     for line in layout.lines:
         on = layout.cells_on(line)
-        on = on[present[on]]
         if len(on) > 1 and left[on].all():
             places.append(str(line))
             left[on] = False

@@ -46,7 +46,7 @@ def shares_of_load(spans: Spans, layout: SensorLayout) -> Floats:
     if len(spans) < FEWEST or not len(moving):
         return found
     light = LIGHT * float(np.quantile(moving, 1 - LOW))
-    present = layout.present.ravel()
+    present = layout.is_cell
     pairs = layout.beside.shape[1] // 2
     for one, other in zip(layout.beside.T[:pairs], layout.beside.T[::-1], strict=False):
         between = np.flatnonzero((one >= 0) & (other >= 0) & present)

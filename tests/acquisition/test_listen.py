@@ -441,7 +441,7 @@ def test_replays_of_old_packets_leave_a_session_in_one_file(tmp_path, monkeypatc
             station.receiver.take(old, i / 10, "10.0.0.1")
     station.receiver.close()
     asyncio.run(station._take_all())
-    for session in station._sessions.values():
+    for session in station._sessions.of.values():
         session.close()
     counters = station.receiver.counters
     assert (counters.received, counters.kept, counters.restarts) == (300 + 3 * 199 - 3, 300, 0)

@@ -83,7 +83,7 @@ def test_thirty_invented_names_a_second_load_nothing_and_take_no_frame_of_a_real
         for name in names:
             made.receiver.take(format_packet(name, step / 10, values), now[0], name)
         take_all(made)
-        watched |= set(made._sessions)
+        watched |= set(made._sessions.of)
     assert watched == {"real", "second"}
     assert len(loaded) == 1
     told = [event.text for event in events if event.kind == "trouble"]
@@ -100,8 +100,8 @@ def test_a_second_device_is_watched_by_itself_and_shares_the_model(station):
             values = rng.uniform(0, 1, power_cut.LAYOUT.n_cells)
             made.receiver.take(format_packet(name, step / 10, values), now[0], name)
         take_all(made)
-    first = made._sessions["first"].watcher
-    second = made._sessions["second"].watcher
+    first = made._sessions.of["first"].watcher
+    second = made._sessions.of["second"].watcher
     assert first._running is second._running
     assert first._monitor is not second._monitor
     assert isinstance(second._monitor, Monitor)

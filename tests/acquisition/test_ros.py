@@ -311,7 +311,7 @@ def test_frames_that_wait_to_be_monitored_are_counted_where_too_many_wait(log):
     assert watch.work() == ()
     for frame in np.resize(log, (WAITING + 2, 220)):
         watch.put(frame)
-    assert watch.left_out == 2
+    assert watch.queue.left_out == 2
 
 
 def test_frames_are_restored_and_no_status_is_stale_while_the_monitor_is_busy(
@@ -464,7 +464,7 @@ def test_the_node_restores_nothing_without_a_bundle_or_a_frame_of_its_sensor(mad
 def test_the_node_puts_exchanged_wires_back_as_the_version_that_the_bundle_runs(
     bundle, small_grasps
 ):
-    follower = Follower(BundleAt(bundle.path).sensor, bundle.path, clock=lambda: 0.0)
+    follower = Follower(BundleAt(bundle.path).sensor, bundle.path)
     watch = Watch(follower.sensor)
     rows = bundle.layout.grid(np.arange(bundle.layout.n_cells)).copy()
     rows[0, [1, 4]] = rows[0, [4, 1]]
@@ -473,7 +473,7 @@ def test_the_node_puts_exchanged_wires_back_as_the_version_that_the_bundle_runs(
     assert follower.poll() is None
     bundle.deploy(bundle.write_version(healthy, {"source": np.argsort(wired).tolist()}).number)
     assert follower.poll() is None  # a thread loads it
-    follower._loading.join()
+    follower.reload.thread.join()
     watch.switch(follower.poll())
     assert watch.sensor.restorer is not None
     np.testing.assert_array_equal(watch.sensor.version.source, np.argsort(wired))
@@ -511,12 +511,12 @@ def test_a_scan_of_the_read_out_is_evidence_of_the_node(small_grasps):
 
 
 def test_a_bundle_that_can_no_longer_be_read_leaves_the_node_as_it_is(bundle, caplog):
-    follower = Follower(BundleAt(bundle.path).sensor, bundle.path, clock=lambda: 0.0)
+    follower = Follower(BundleAt(bundle.path).sensor, bundle.path)
     bundle.deploy(1)
     for file in bundle.path.glob("bundle*.json"):
         file.unlink()
     assert follower.poll() is None
-    follower._loading.join()
+    follower.reload.thread.join()
     assert follower.poll() is None
     assert "all goes on as before" in caplog.text
 

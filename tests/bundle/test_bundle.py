@@ -214,7 +214,7 @@ def test_a_bundle_that_cannot_be_written_runs_all_the_same(bundle, monkeypatch):
     def refuse(*args, **kwargs):
         raise PermissionError(13, "read-only")
 
-    monkeypatch.setattr("adaptfault.bundle.bundle.locked", refuse)
+    monkeypatch.setattr("adaptfault.bundle.running.locked", refuse)
     assert bundle.begin().number == 2
 
 

@@ -19,15 +19,15 @@ import pytest
 import adaptfault as af
 from adaptfault.acquisition import Session
 from adaptfault.acquisition.ordering import Frame
-from adaptfault.bundle import bundle as bundle_module
 from adaptfault.bundle import journal as journal_module
-from adaptfault.bundle import lock
+from adaptfault.bundle import lock, reload, running
 from adaptfault.bundle.checksummed_json import Damaged, reading
 from adaptfault.bundle.journal import Entry
 from adaptfault.bundle.lock import Busy, locked
 from adaptfault.bundle.pointer import Pointer
 from adaptfault.cli import main
 from adaptfault.prediction import predictor
+from adaptfault.prediction.inference import Inference
 from diagnostics import FaultSet
 
 WINDOW = np.zeros((1, 10, power_cut.LAYOUT.n_cells), np.float32)
@@ -178,7 +178,7 @@ def test_who_waits_for_a_lock_waits_for_two_seconds_at_most(monkeypatch, tmp_pat
 def test_a_confirmation_while_another_program_holds_the_journal_counts_and_its_entry_waits(
     carried, monkeypatch
 ):
-    monkeypatch.setattr(bundle_module, "_IN_LOOP", 0.0)
+    monkeypatch.setattr(running, "_IN_LOOP", 0.0)
     deploy(carried, 3)
     bundle = af.Bundle.open(carried)
     # so that there is a journal
@@ -237,8 +237,8 @@ def test_a_version_that_could_not_be_loaded_for_a_while_is_loaded_later(
     carried, monkeypatch, error, caplog
 ):
     monkeypatch.setattr(predictor, "_POLL", 0.0)
-    monkeypatch.setattr(predictor, "_RETRY", 0.0)
-    real = predictor.Inference.load
+    monkeypatch.setattr(reload, "_RETRY", 0.0)
+    real = Inference.load
     left = [2]
 
     def load(folder):
@@ -248,12 +248,12 @@ def test_a_version_that_could_not_be_loaded_for_a_while_is_loaded_later(
         return real(folder)
 
     running = af.Predictor.load(carried)
-    monkeypatch.setattr(predictor.Inference, "load", load)
+    monkeypatch.setattr(Inference, "load", load)
     deploy(carried, 3)
     for _ in range(1000):
         running.predict(WINDOW)
-        if running._loading is not None:
-            running._loading.join()
+        if running._reload.thread is not None:
+            running._reload.thread.join()
         if running.version == 2:
             break
     assert running.version == 2
@@ -264,7 +264,7 @@ def test_a_start_that_fails_for_lack_of_files_does_not_count_against_the_version
     carried, monkeypatch
 ):
     deploy(carried, 3)
-    real = predictor.Inference.load
+    real = Inference.load
     left = [2]
 
     def load(folder):
@@ -273,7 +273,7 @@ def test_a_start_that_fails_for_lack_of_files_does_not_count_against_the_version
             raise OSError(errno.EMFILE, "Too many open files")
         return real(folder)
 
-    monkeypatch.setattr(predictor.Inference, "load", load)
+    monkeypatch.setattr(Inference, "load", load)
     assert af.Predictor.load(carried).version == 2
     assert Pointer.read(carried).starts == 1
 

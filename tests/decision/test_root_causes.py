@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from diagnostics import Fault, FaultKind, Line, SensorLayout
-from diagnostics.decision.root_causes import CellFindings, root_causes
+from diagnostics.decision.cell_findings import CellFindings
+from diagnostics.decision.root_causes import root_causes
 
 LAYOUT = SensorLayout(2, 11, 6)
 CELLS = LAYOUT.n_cells

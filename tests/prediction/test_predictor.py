@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from conftest import DROPPED, SMALL, small_windows
 
+from adaptfault.bundle import reload
 from adaptfault.bundle.bundle import Bundle
 from adaptfault.bundle.versions import Version
 from adaptfault.data.atomic import atomic_write
@@ -92,7 +93,7 @@ def carried(versions, tmp_path, fitted_small) -> Carried:
 def eager(monkeypatch) -> None:
     """Look for a new version at every frame."""
     monkeypatch.setattr(module, "_POLL", 0.0)
-    monkeypatch.setattr(module, "_RETRY", 0.0)
+    monkeypatch.setattr(reload, "_RETRY", 0.0)
 
 
 def running(carried: Carried, number: int = 1) -> Predictor:

@@ -505,11 +505,11 @@ def test_links_in_circles_and_deep_groups_end(tmp_path):
 
 
 def test_the_groups_of_a_file_are_gone_through_once_each(tmp_path, monkeypatch):
-    from adaptfault.data.recordings.formats.datasets import chooser
+    from adaptfault.data.recordings.formats.datasets import beside
 
     steps = []
-    whole = chooser.is_vector
-    monkeypatch.setattr(chooser, "is_vector", lambda *a: steps.append(0) or whole(*a))
+    whole = beside.is_vector
+    monkeypatch.setattr(beside, "is_vector", lambda *a: steps.append(0) or whole(*a))
     for count in (20, 40):
         with h5py.File(tmp_path / f"{count}.h5", "w") as file:
             for i in range(count):

@@ -19,7 +19,7 @@ from adaptfault.data.recordings import (
     save_npz,
 )
 from adaptfault.data.recordings.formats import spans
-from adaptfault.data.recordings.load import Opened
+from adaptfault.data.recordings.opened import Opened
 from diagnostics import SensorLayout
 
 LAYOUT = SensorLayout.paper()

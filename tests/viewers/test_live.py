@@ -205,7 +205,7 @@ def test_devices_have_topics_of_their_own_and_silence_is_stale(tmp_path):
             station.receiver.take(data, i / 10, "10.0.0.1")
     station.receiver.close()
     asyncio.run(station._take_all())
-    station._view.tell("left", station._sessions["left"].idle(time.monotonic() + 10))
+    station._view.tell("left", station._sessions.of["left"].idle(time.monotonic() + 10))
     station._close_view()
     for device in ("left", "right"):
         np.testing.assert_array_equal(frames_in(path, device)[1], VALUES)

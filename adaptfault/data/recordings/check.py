@@ -56,7 +56,7 @@ def check_readings(
     problems: list[Problem] = []
     counts = {"infinite": 0, "missing": 0}
     first: dict[str, str] = {}
-    present = layout.present.ravel()
+    present = layout.is_cell
     for i, survey in enumerate(content.surveys):
         error = ""
         if not survey.length:
@@ -168,7 +168,7 @@ class OutOfRange:
         before = self._seen.get(i, 0)
         self._seen[i] = before + len(frames)
         outside = (frames < -slack) | (frames > full + slack)
-        outside &= self.layout.present.ravel()
+        outside &= self.layout.is_cell
         if not outside.any():
             return
         frame = int(np.flatnonzero(outside.any(axis=1))[0])

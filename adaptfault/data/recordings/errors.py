@@ -72,3 +72,12 @@ def located(path: str | PathLike[str], what: str, where: str = "") -> str:
     holds."""
     line = f"{path}, {where}: {what}" if where else f"{path}: {what}"
     return printable(line).replace("\n", "\\n")
+
+
+@contextmanager
+def noted(problems: list[Problem]) -> Iterator[None]:
+    """Add an InputError to problems, so that the other files are read."""
+    try:
+        yield
+    except InputError as error:
+        problems.append(Problem("error", str(error)))

@@ -41,20 +41,23 @@ class Found:
 
 
 def find(
-    paths: Sequence[Path], known: Mapping[str, Reader], aside: Collection[Path]
-) -> tuple[list[Found], list[Problem]]:
+    paths: Sequence[Path],
+    known: Mapping[str, Reader],
+    aside: Collection[Path],
+    problems: list[Problem],
+) -> list[Found]:
     """Return the files that a reader accepts, each once; folders in natural order, with subfolders.
 
     Args:
         paths: files and folders, in the order wanted.
         known: the readers.
         aside: resolved paths of files that are no recordings (tables, layouts).
+        problems: of all files.
 
     Raises:
         InputError: a path does not exist.
     """
     found: dict[Path, Found] = {}
-    problems: list[Problem] = []
     endings = ", ".join(suffixes(known))
     for path in paths:
         try:
@@ -81,7 +84,7 @@ def find(
             problems.append(Problem("error", located(path, what)))
     for one in found.values():
         _log.debug("%s: read by %s", one.path, getattr(one.reader, "__name__", one.reader))
-    return list(found.values()), problems
+    return list(found.values())
 
 
 def _below(root: Path, known: Mapping[str, Reader], problems: list[Problem]) -> Iterator[Found]:

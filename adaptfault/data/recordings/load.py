@@ -6,36 +6,25 @@ for its frames. Small and large ones take the same way and get the same checks.
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import groupby
-from operator import itemgetter
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from adaptfault.data.addresses import is_address
 from adaptfault.data.recordings.check import (
-    OutOfRange,
     check_readings,
     check_scale,
     check_width,
-    clamped_readings,
     other_lengths,
-    out_of_range,
-    without_infinite,
 )
 from adaptfault.data.recordings.dataset import Recordings
 from adaptfault.data.recordings.doubts import copies, doubts
-from adaptfault.data.recordings.errors import InputError, Problem, foreseeing
-from adaptfault.data.recordings.facts.classes import class_indices, label_files
+from adaptfault.data.recordings.errors import InputError, Problem, foreseeing, noted
+from adaptfault.data.recordings.facts.classes import label_files
 from adaptfault.data.recordings.facts.infer import PAPER, SLACK
 from adaptfault.data.recordings.facts.layout_file import LAYOUT_NAME, layout_beside, not_stated
-from adaptfault.data.recordings.facts.rates import Clock, Elapsed
 from adaptfault.data.recordings.facts.resolve import (
     check_agreement,
     check_statements,
@@ -44,8 +33,9 @@ from adaptfault.data.recordings.facts.resolve import (
 )
 from adaptfault.data.recordings.facts.targets import TargetTable, target_files
 from adaptfault.data.recordings.files import Found, find, passed_over
+from adaptfault.data.recordings.opened import Opened
 from adaptfault.data.recordings.readers import check_stated, readers
-from adaptfault.data.recordings.recording import BLOCK, Recording, Shape
+from adaptfault.data.recordings.recording import Recording, Shape
 from adaptfault.data.recordings.remote import fetched
 from adaptfault.data.recordings.survey import Content, Surveyor
 from diagnostics import SensorLayout
@@ -53,19 +43,17 @@ from diagnostics.shown import shown
 
 if TYPE_CHECKING:
     from adaptfault.data.calibration import Calibration
-    from diagnostics import Scan
 
 PathName = str | PathLike[str]
 
 Listed = tuple[Found, list[Recording]]
 """A file, and the recordings in it."""
 
+Select = Callable[[int], Iterable[int]]
+"""Returns the numbers, from 0, of the recordings that are meant, of how many there are."""
+
 ROOM = 256_000_000
 """Bytes of frames that :func:`open_recordings` keeps, so that small files are read once."""
-
-
-PART = 5_000_000
-"""Readings of a log that are in memory at once."""
 
 
 def _nothing(done: int) -> None:
@@ -91,151 +79,6 @@ class Loaded:
 
     def __str__(self) -> str:
         return "\n".join([str(self.recordings), *map(str, self.problems), *self.inferred])
-
-
-class Opened:
-    """Recordings whose frames are read when they are asked for; may be iterated more than once.
-
-    Iterating yields float32 ``[T, D]`` in the layout's unit, one recording after the other; NaN =
-    missing.
-
-    Attributes:
-        layout: the array.
-        lengths: frames of each recording.
-        labels, class_names, names, targets, value_names: as in
-            :class:`~adaptfault.data.recordings.dataset.Recordings`.
-        inferred: as in :class:`Loaded`.
-        problems: errors and warnings.
-        origins: the recordings as their readers give them: which arrays of a data set hold them.
-        n_found: number of all recordings, of which these were selected.
-        late_problems: warnings about the range of readings, after a whole iteration.
-        scan: of the read-out, of all files; None: there is none.
-    """
-
-    def __init__(
-        self,
-        contents: Sequence[Content],
-        layout: SensorLayout,
-        inferred: tuple[str, ...],
-        tables: Calibration | None,
-        problems: list[Problem],
-        values: TargetTable | None,
-        n_found: int | None = None,
-        scan: Scan | None = None,
-    ) -> None:
-        self.scan = scan
-        self._tables = tables
-        self.layout = layout
-        self.inferred = inferred
-        self._each = [(content, i) for content in contents for i in content.kept]
-        self._surveys = [content.surveys[i] for content, i in self._each]
-        self.origins = tuple(content.recordings[i] for content, i in self._each)
-        self.names = tuple(content.name(i) for content, i in self._each)
-        self.lengths = tuple(survey.length for survey in self._surveys)
-        labels = [content.labels[i] if content.labels else None for content, i in self._each]
-        orders = [content.facts.class_names for content in contents]
-        self.labels, self.class_names = class_indices(labels, orders, problems)
-        self.value_names: tuple[str, ...] = ()
-        self.targets: tuple[NDArray[np.float32], ...] | None = None
-        if values is not None:
-            self.value_names = values.names
-            self.targets = tuple(one.targets for one, _ in self._each if one.targets is not None)
-        self.problems = tuple(problems)
-        self.late_problems: tuple[Problem, ...] = ()
-        self.n_found = len(self) if n_found is None else n_found
-
-    @property
-    def clock(self) -> Clock:
-        """How regular the times of the frames are."""
-        elapsed = Elapsed.of_all(survey.elapsed for survey in self._surveys)
-        return Clock() if elapsed is None else elapsed.clock()
-
-    @property
-    def seconds(self) -> float:
-        """How long the recordings took: by their times where there are some, else by their
-        rate."""
-        timed = Elapsed.of_all(survey.elapsed for survey in self._surveys)
-        usual = None if timed is None else timed.unit()
-        total = 0.0
-        for survey in self._surveys:
-            unit = survey.tick or usual
-            if survey.elapsed is None or unit is None:
-                total += survey.length / self.layout.rate
-            else:
-                total += survey.elapsed.seconds(unit)
-        return total
-
-    def __len__(self) -> int:
-        return len(self.lengths)
-
-    def __iter__(self) -> Iterator[NDArray[np.float32]]:
-        for pieces in self._recordings():
-            yield np.concatenate(list(pieces))
-
-    def pieces(self, frames: int = BLOCK) -> Iterator[NDArray[np.float32]]:
-        """Yield all recordings in pieces ``[t, D]`` of about so many frames, in constant memory.
-
-        A piece holds frames of one recording.
-        """
-        for blocks in self._recordings():
-            held: list[NDArray[np.float32]] = []
-            for block in blocks:
-                held.append(block)
-                if sum(map(len, held)) >= frames:
-                    yield np.concatenate(held)
-                    held = []
-            if held:
-                yield np.concatenate(held)
-
-    def parts(self, readings: int = PART) -> Iterator[list[NDArray[np.float32]]]:
-        """Yield all recordings in lists of at most about so many readings; long recordings are cut.
-
-        A log that is not larger is one list of whole recordings.
-        """
-        frames = max(1, readings // self.layout.n_cells)
-        if sum(self.lengths) <= frames:
-            yield list(self)
-            return
-        part: list[NDArray[np.float32]] = []
-        for piece in self.pieces(frames):
-            if part and sum(map(len, part)) + len(piece) > frames:
-                yield part
-                part = []
-            part.append(piece)
-        yield part
-
-    def _recordings(self) -> Iterator[Iterator[NDArray[np.float32]]]:
-        """Yield the blocks of each recording, calibrated."""
-        clamped = np.zeros((2, self.layout.n_cells), dtype=np.int64)
-        outside: list[Problem] = []
-        files = 0
-        for content, each in groupby(self._each, key=itemgetter(0)):
-            files += 1
-            range_ = OutOfRange(content, self.layout)
-            for _, i in each:
-                yield self._blocks(content, i, clamped, range_)
-            problem = range_.problem()
-            if problem is not None:
-                outside.append(problem)
-        late = out_of_range(outside, files, self.layout)
-        if clamped.any():
-            late.append(clamped_readings(clamped))
-        self.late_problems = tuple(late)
-
-    def _blocks(
-        self, content: Content, i: int, clamped: NDArray[np.int64], range_: OutOfRange
-    ) -> Iterator[NDArray[np.float32]]:
-        for block in content.recordings[i].blocks():
-            if not len(block.values):
-                continue
-            readings = without_infinite(block.values)
-            if self._tables is not None:
-                readings, out = self._tables.apply(readings)
-                clamped += np.stack([out.below, out.above])
-            with np.errstate(all="ignore"):
-                readings = readings.astype(np.float32, copy=False)
-            range_.add(i, readings, block.lines)
-            yield readings
 
 
 def load(paths: PathName | Iterable[PathName], *, strict: bool = False, **options: Any) -> Loaded:
@@ -314,7 +157,7 @@ def open_recordings(
     targets: PathName | None = None,
     room: int | None = ROOM,
     progress: Callable[[int], None] = _nothing,
-    select: Callable[[int], Iterable[int]] | None = None,
+    select: Select | None = None,
     **stated: Any,
 ) -> Opened:
     """Return recordings of any size; their frames are read when they are asked for.
@@ -329,62 +172,50 @@ def open_recordings(
     Raises:
         InputError: as :func:`load`.
     """
-    before: list[Problem] = []
-    given = [_place(path, stated, before) for path in _all(paths)]
-    if layout is not None and shape is not None:
-        raise InputError("layout and shape both given: one of them is enough")
-    _check_options(given, frames, labels, targets)
+    problems: list[Problem] = []
+    given = local_paths(paths, stated, problems)
+    _check_options(given, layout, shape, frames, labels, targets)
     layout = shape if layout is None else layout
     array = given_array(layout) if layout is not None else layout_beside(given)
     tables = _calibration(calibration)
     values = None if targets is None else TargetTable(Path(targets))
     tables_given = (layout, labels, calibration, targets)
     aside = {Path(p).resolve() for p in tables_given if isinstance(p, str | PathLike)}
-    found, problems = find(given, readers(), aside)
-    problems[:0] = before
+    found = find(given, readers(), aside, problems)
     surveyor = Surveyor(PAPER.full_scale * SLACK, 2**62 if room is None else room, progress)
-    listed: Iterable[Listed] = _listed(found, _asked(stated, array), problems)
-    unread: list[Found] = []
-    n_found = None
-    if select is not None:
-        every = list(listed)
-        n_found = sum(len(recordings) for _, recordings in every)
-        listed = _selected(every, select(n_found))
-        unread = _without_labels(every, [file for file, _ in listed])
-    contents = _surveyed(listed, surveyor, problems)
+    listed = _listed(found, _asked(stated, array), problems)
+    contents, unread, n_found = _surveyed(listed, select, surveyor, problems)
     if values is not None:
         contents = target_files(contents, values, problems)
     else:
-        table = None if labels is None else Path(labels)
-        contents = label_files(contents, table, problems, unread)
+        contents = label_files(contents, labels, problems, unread)
     if not contents:
-        raise nothing_left(problems)
+        raise _nothing_left(problems)
     options = {"full_scale": full_scale, "unit": unit, "rate": rate}
     unstated = not_stated(layout, given)
     known, inferred = resolve_layout(contents, array, options, tables, unstated, problems)
     is_beside = layout is None and array is not None
     beside = f" of the {LAYOUT_NAME} beside the recordings" if is_beside else ""
-
-    def check(content: Content) -> None:
-        check_agreement(content, contents, tables is not None, rate)
-        check_width(content, known, beside, strict=strict)
-        if strict:
-            check_statements(content, known, tables is not None)
-
-    usable = _usable(contents, known, check, frames, problems)
+    calibrated = tables is not None
+    usable = _usable(contents, known, beside, rate, frames, problems, calibrated, strict)
     scan = surveyor.scans.of(known, problems)
     return Opened(usable, known, inferred, tables, problems, values, n_found, scan)
 
 
 def local_paths(
-    paths: PathName | Iterable[PathName] | Any, stated: Mapping[str, Any]
+    paths: PathName | Iterable[PathName] | Any, stated: Mapping[str, Any], problems: list[Problem]
 ) -> list[Path]:
     """Return where paths are read: addresses as their copies on this machine.
 
     Args:
         paths, stated: as for :func:`load`.
+        problems: warnings are added to it.
     """
-    return [_place(path, stated, []) for path in _all(paths)]
+    key = _key(stated)
+    return [
+        fetched(str(path), readers(), key, problems) if is_address(path) else Path(path)
+        for path in _all(paths)
+    ]
 
 
 def _all(paths: PathName | Iterable[PathName] | Any) -> list[PathName]:
@@ -396,20 +227,23 @@ def _all(paths: PathName | Iterable[PathName] | Any) -> list[PathName]:
     return [paths] if isinstance(paths, str | PathLike) else list(paths)
 
 
-def _place(path: PathName, stated: Mapping[str, Any], problems: list[Problem]) -> Path:
-    """Return where to read a path: itself, or the copy of what is at an address."""
-    if not is_address(path):
-        return Path(path)
+def _key(stated: Mapping[str, Any]) -> str | None:
+    """Return which arrays are stated to hold the readings, divided by commas."""
     key = stated.get("key")
-    if not isinstance(key, str | None):
-        key = ",".join(key)
-    return fetched(str(path), readers(), key, problems)
+    return key if isinstance(key, str | None) else ",".join(key)
 
 
 def _check_options(
-    given: Sequence[Path], frames: int | None, labels: object, targets: object
+    given: Sequence[Path],
+    layout: object,
+    shape: object,
+    frames: int | None,
+    labels: object,
+    targets: object,
 ) -> None:
     """Raise InputError where an option is wrong, or contradicts another one."""
+    if layout is not None and shape is not None:
+        raise InputError("layout and shape both given: one of them is enough")
     if not given:
         raise InputError("no path given; name a recording or a folder of recordings")
     if frames is not None and frames < 1:
@@ -423,26 +257,25 @@ def _check_options(
 def _asked(stated: Mapping[str, Any], array: SensorLayout | Shape | None) -> dict[str, Any]:
     """Return what readers are told of the files."""
     check_stated(stated)
-    key = stated.get("key")
-    if not isinstance(key, str | None):
-        key = ",".join(key)
-    return {**stated, "key": key, "shape": getattr(array, "shape", array)}
+    return {**stated, "key": _key(stated), "shape": getattr(array, "shape", array)}
 
 
 def _surveyed(
-    listed: Iterable[Listed], surveyor: Surveyor, problems: list[Problem]
-) -> list[Content]:
-    """Return the contents of files; what cannot be read is told, and the others are read."""
+    listed: Iterable[Listed], select: Select | None, surveyor: Surveyor, problems: list[Problem]
+) -> tuple[list[Content], list[Found], int | None]:
+    """Return the contents of files, what is not read of them where some are selected, and of how
+    many recordings these are; what cannot be read is told, and the others are read."""
     contents = []
+    unread: list[Found] = []
+    n_found = None
+    if select is not None:
+        listed, unread, n_found = _selected(list(listed), select)
     for file, recordings in listed:
-        try:
-            with foreseeing(file.path):
-                content = surveyor(file, recordings, problems)
-                if content is not None:
-                    contents.append(content)
-        except InputError as error:
-            problems.append(Problem("error", str(error)))
-    return contents
+        with noted(problems), foreseeing(file.path):
+            content = surveyor(file, recordings, problems)
+            if content is not None:
+                contents.append(content)
+    return contents, unread, n_found
 
 
 def _listed(
@@ -452,29 +285,31 @@ def _listed(
     told."""
     notes: list[Path] = []
     for file in found:
-        try:
-            with foreseeing(file.path):
-                recordings = list(file.reader.open(file.path, **asked))
-        except InputError as error:
-            problems.append(Problem("error", str(error)))
-            continue
+        recordings = None
+        with noted(problems), foreseeing(file.path):
+            recordings = list(file.reader.open(file.path, **asked))
         if recordings:
             yield file, recordings
-        else:
+        elif recordings is not None:
             notes.append(file.path)
     problems += passed_over(notes)
 
 
-def _selected(listed: Sequence[Listed], numbers: Iterable[int]) -> list[Listed]:
-    """Return the recordings with these numbers, which keep their names, and their files."""
-    chosen = set(numbers)
-    number = iter(range(sum(len(recordings) for _, recordings in listed)))
+def _selected(listed: Sequence[Listed], select: Select) -> tuple[list[Listed], list[Found], int]:
+    """Return the recordings that are selected, which keep their names, and their files, the other
+    files that state no label of a recording, and how many recordings there are."""
+    n_found = sum(len(recordings) for _, recordings in listed)
+    chosen = set(select(n_found))
+    number = iter(range(n_found))
     selected = []
+    unread = []
     for file, recordings in listed:
         kept = [one for one in _named(file, recordings) if next(number) in chosen]
         if kept:
             selected.append((file, kept))
-    return selected
+        elif any(one.label is None for one in recordings):
+            unread.append(file)
+    return selected, unread, n_found
 
 
 def _named(file: Found, recordings: Sequence[Recording]) -> list[Recording]:
@@ -487,44 +322,44 @@ def _named(file: Found, recordings: Sequence[Recording]) -> list[Recording]:
     ]
 
 
-def _without_labels(listed: Sequence[Listed], read: Sequence[Found]) -> list[Found]:
-    """Return the files that are not ``read``, and state no label of a recording."""
-    others = [(file, recordings) for file, recordings in listed if file not in read]
-    return [file for file, recordings in others if any(one.label is None for one in recordings)]
-
-
 def _usable(
     contents: Sequence[Content],
     layout: SensorLayout,
-    check: Callable[[Content], None],
+    beside: str,
+    rate: float | None,
     frames: int | None,
     problems: list[Problem],
+    calibrated: bool,
+    strict: bool,
 ) -> list[Content]:
     """Return the files that can be used; what is wrong, and doubts, are added to ``problems``.
 
     Args:
         contents: of the files.
         layout: the array.
-        check: raises InputError where a file does not fit the array or the other files.
+        beside: where it was found, for messages; "": nowhere beside the recordings.
+        rate: stated for all files.
         frames: that each recording must have; None: any.
         problems: of all files.
+        calibrated: whether a calibration turns the counts into newtons.
+        strict: whether a file that states something else is refused.
 
     Raises:
         InputError: none can be used.
     """
     usable = []
     for content in contents:
-        try:
-            check(content)
-        except InputError as error:
-            problems.append(Problem("error", str(error)))
-            continue
-        kept, told = check_readings(content, layout, frames)
-        problems += told
-        if kept:
-            usable.append(replace(content, kept=tuple(kept)))
+        with noted(problems):
+            check_agreement(content, contents, calibrated, rate)
+            check_width(content, layout, beside, strict=strict)
+            if strict:
+                check_statements(content, layout, calibrated)
+            kept, told = check_readings(content, layout, frames)
+            problems += told
+            if kept:
+                usable.append(replace(content, kept=tuple(kept)))
     if not usable:
-        raise nothing_left(problems)
+        raise _nothing_left(problems)
     is_labelled = any(one.labels or one.targets is not None for one in usable)
     problems += doubts(usable, layout, labelled=is_labelled)
     problems += other_lengths(usable) if frames is None else []
@@ -540,14 +375,10 @@ def _calibration(calibration: Calibration | PathName | None) -> Calibration | No
     return Calibration.read(calibration)
 
 
-def nothing_left(problems: Sequence[Problem]) -> InputError:
+def _nothing_left(problems: Sequence[Problem]) -> InputError:
     """Return the error for a run that has no recording left: the first problem, and how many there
     are."""
-    errors = [problem for problem in problems if problem.level == "error"] or list(problems)
-    counts = Counter(problem.level for problem in problems)
-    count = (
-        f"{counts['error']} error{'s' * (counts['error'] != 1)}"
-        if counts["error"]
-        else f"{counts['warning']} warnings"
-    )
-    return InputError(f"{errors[0].message} (no recording is left; {count} in all)")
+    errors = [problem for problem in problems if problem.level == "error"]
+    found = errors or problems
+    count = f"{len(found)} {'error' if errors else 'warning'}{'s' * (found != errors[:1])}"
+    return InputError(f"{found[0].message} (no recording is left; {count} in all)")

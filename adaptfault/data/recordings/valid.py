@@ -49,7 +49,7 @@ def valid_masks(
         if fault.recordings is None:
             cells = list(fault.cells)
             onset[cells] = np.minimum(onset[cells], fault.onset or 0)
-    present = layout.present.ravel()
+    present = layout.is_cell
     before = 0
     for number, frames in enumerate(recordings):
         at = before + np.arange(len(frames))[:, None]

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
+from os import PathLike
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +19,7 @@ from adaptfault.data.recordings.survey import Content
 
 def label_files(
     contents: Sequence[Content],
-    table: Path | None,
+    given: str | PathLike[str] | None,
     problems: list[Problem],
     beside: Sequence[Found] = (),
 ) -> list[Content]:
@@ -27,6 +28,7 @@ def label_files(
 
     ``beside``: other files without labels, of which nothing is read.
     """
+    table = None if given is None else Path(given)
     known: dict[Path, dict[Path, str]] = {}
     listings = {table or content.file.table for content in contents}
     for path in sorted(path for path in listings if path is not None):

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptfault.data.recordings.errors import InputError, Problem
+from adaptfault.data.recordings.errors import InputError, Problem, noted
 from adaptfault.data.recordings.facts.labels import FileTable
 from adaptfault.data.recordings.survey import Content
 
@@ -124,11 +124,8 @@ def target_files(
     kept = []
     for content in contents:
         lengths = [survey.length for survey in content.surveys]
-        try:
+        with noted(problems):
             targets = table.of(content.path, lengths)
-        except InputError as error:
-            problems.append(Problem("error", str(error)))
-        else:
             kept.append(replace(content, targets=targets, labels=None))
     return kept
 

@@ -109,6 +109,11 @@ class Columns:
         return [slice(*pair) for pair in pairwise(ends)]
 
     @property
+    def aside(self) -> set[int | None]:
+        """The columns that are no readings, but say something of them."""
+        return {self.clock, self.label, self.episode, self.scan}
+
+    @property
     def used(self) -> list[int]:
         """The columns of numbers that are read, in the order of the file."""
         aside = {column for column in (self.clock, self.scan) if column is not None}
@@ -142,60 +147,60 @@ def choose_columns(
     ignored = set() if ignore is None else set(table.several("ignore", ignore))
     wanted = None if columns is None else table.several("columns", columns)
     roles = _by_names(table, {*ignored, *(wanted or ())}, time_column, label_column)
-    aside = {*no_readings(table.names), roles.clock, roles.label, roles.episode, roles.scan}
+    aside = {*no_readings(table.names), *roles.aside}
     readings = [i for i in range(dialect.width) if i not in aside] if wanted is None else wanted
-    inferred: tuple[str, ...] = ()
-    problems: tuple[Problem, ...] = ()
     if roles.clock is None and 0 not in ignored and (0 in readings) == (wanted is None):
         fills = shape is not None and math.prod(shape) == len(readings)
         ticks = _clock_of(path, dialect, even=wanted is not None or not fills)
         if ticks is not None:
-            roles = replace(roles, clock=0, unit=ticks or None)
-            problems = (Problem.warning(path, _TAKEN),)
-    aside = {*ignored, roles.clock, roles.label, roles.episode, roles.scan}
+            warned = (Problem.warning(path, _TAKEN),)
+            roles = replace(roles, clock=0, unit=ticks or None, problems=warned)
+    aside = {*ignored, *roles.aside}
     readings = [i for i in readings if i not in aside]
+    inferred: tuple[str, ...] = ()
     if wanted is None:
         readings, inferred = _numbered(table.names, readings, shape)
-    table.refuse_text(readings)
-    if not readings:
-        held = "numbers of frames" if roles.clock is None else "a column of times"
-        raise InputError.at(
-            path, f"holds {held} and no readings; add one column a cell", table.first_line
-        )
+    table.check(readings, roles.clock)
     names = tuple(table.names[i] for i in readings) if table.names else ()
-    if names and columns is None:
+    if columns is None:
         _refuse_summaries(path, names)
     axes, order = axes_of(names)
-    if shape is not None and math.prod(shape) == len(names) // axes:
-        shape = shape[0], shape[1], shape[2] * axes
-    if axes > 1:
-        readings = [readings[i] for i in order]
-        names = tuple(names[i] for i in order)
-    shown = None
-    pads = None
-    if axes > 1:
-        what = f"{len(names) // axes} positions of {axes} axes, {names[0]} to {names[-1]}"
-        shown = shape or (1, 1, len(names)), what
-    elif shape is None and names:
-        shown = shape_of(names)
-        unequal = sizes_of(names) if shown is None else None
-        if unequal is not None:
-            pads = Pads.of(unequal[0])
-            assert pads.shape is not None
-            shown = pads.shape, unequal[1]
+    readings = [readings[i] for i in order] or readings
+    names = tuple(names[i] for i in order)
+    shown, reason, pads = _shown(names, axes, shape)
     others = set(range(dialect.width)) - {*readings, roles.clock, roles.scan}
     return replace(
         roles,
         readings=tuple(readings),
         names=names,
-        shape=None if shown is None else shown[0],
-        shape_reason="" if shown is None else shown[1],
+        shape=shown,
+        shape_reason=reason,
         inferred=inferred,
         has_text=table.has_unreadable(others),
-        problems=problems,
         pads=pads,
         axes=axes,
     )
+
+
+def _shown(
+    names: Sequence[str], axes: int, shape: Shape | None
+) -> tuple[Shape | None, str, Pads | None]:
+    """Return the shape that the names of readings show where it is not stated, how they show it,
+    and the pads where these differ in size."""
+    if axes > 1:
+        positions = len(names) // axes
+        stands = shape or (1, 1, len(names))
+        if math.prod(stands) == positions:
+            stands = stands[0], stands[1], stands[2] * axes
+        return stands, f"{positions} positions of {axes} axes, {names[0]} to {names[-1]}", None
+    shown = None if shape else shape_of(names)
+    if shown is not None:
+        return *shown, None
+    unequal = None if shape else sizes_of(names)
+    if unequal is None:
+        return None, "", None
+    pads = Pads.of(unequal[0])
+    return pads.shape, unequal[1], pads
 
 
 def _refuse_summaries(path: Path, names: Sequence[str]) -> None:
@@ -303,29 +308,26 @@ class _Named:
         more = f", ... ({self.width} in all)" if self.width > _LISTED else ""
         return ", ".join(name or f"{i}" for i, name in enumerate(self.names[:_LISTED])) + more
 
-    def text(self) -> list[int]:
-        """Return the columns in which the first lines hold text, and no number."""
-        probe = self._dialect.probe
-        columns = self._dialect.texts(probe[0]) if probe else []
-        if not columns:
-            return []
-        rows = [self._dialect.split(line) for line in probe]
-        numbers = {
-            i: [self._dialect.number(row[i]) for row in rows if i < len(row)] for i in columns
-        }
-        return [i for i in columns if all(n is None or n != n for n in numbers[i])]
-
     def has_unreadable(self, columns: Collection[int]) -> bool:
         """Return whether the first line holds text or a date in one of some columns."""
         probe = self._dialect.probe[:1]
         return any(i in columns for line in probe for i in self._dialect.unreadable(line))
 
-    def refuse_text(self, readings: Sequence[int]) -> None:
-        """Raise InputError where there is text in a column of readings."""
-        text = [i for i in self.text() if i in readings]
+    def check(self, readings: Sequence[int], clock: int | None) -> None:
+        """Raise InputError where there is no reading, or the first lines hold text, and no number,
+        in a column of readings."""
+        if not readings:
+            held = "numbers of frames" if clock is None else "a column of times"
+            what = f"holds {held} and no readings; add one column a cell"
+            raise InputError.at(self.path, what, self.first_line)
+        probe = self._dialect.probe
+        text = [i for line in probe[:1] for i in self._dialect.texts(line) if i in readings]
+        for row in map(self._dialect.split, probe):
+            numbers = {i: self._dialect.number(row[i]) for i in text if i < len(row)}
+            text = [i for i in text if (n := numbers.get(i)) is None or n != n]
         if not text:
             return
-        cell = self._dialect.split(self._dialect.probe[0])[text[0]]
+        cell = self._dialect.split(probe[0])[text[0]]
         named = ",".join(self.names[i] if self.names and self.names[i] else str(i) for i in text)
         what = (
             f"{quoted(cell)} is not a number; write the reading, or leave a column"

@@ -19,9 +19,10 @@ last number of a full line cannot be detected.
 from __future__ import annotations
 
 import builtins
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -123,11 +124,8 @@ def open(
         places=None if pads is None else pads.places,
         problems=(*held.problems, *lost),
     )
-
-    def blocks(span: Span) -> Callable[[], Iterator[Block]]:
-        return lambda: _blocks(path, dialect, held, span)
-
-    return [Recording(facts, blocks(span), span.name, span.label) for span in spans]
+    blocks = partial(_blocks, path, dialect, held)
+    return [Recording(facts, partial(blocks, span), span.name, span.label) for span in spans]
 
 
 def _no_numbers(path: Path) -> InputError:

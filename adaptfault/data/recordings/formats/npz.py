@@ -103,20 +103,14 @@ def open(path: Path, *, shape: Shape | None = None, **stated: Any) -> list[Recor
         what = f"array 'names' has {len(names)} entries for {len(recordings)} recordings"
         raise InputError.at(path, f"{what}; give one each")
     present = _present(path, arrays, facts)
-    numbers = {"full_scale": _in_counts(beside.get("full_scale"))}
-    numbers["rate"] = next((beside[key] for key in _RATES if key in beside), None)
-    for key, value in numbers.items():
-        if isinstance(value, str):
-            what = f"{key} is {shown(value)}, no number: ignored"
-            problems = (*problems, Problem.warning(path.with_suffix(".json"), what))
     facts = replace(
         facts,
         class_names=class_names,
         numbered=numbered,
         shape=facts.shape if present is None else present.shape,
         present=present,
-        full_scale=_scalar(path, arrays, "full_scale", numbers["full_scale"]),
-        rate=_scalar(path, arrays, "rate", numbers["rate"]),
+        full_scale=_scalar(path, arrays, "full_scale", beside),
+        rate=_scalar(path, arrays, "rate", beside),
         unit=_unit(arrays, beside),
         declared=_declared(arrays.get("layout")) | _device(arrays.get("device")),
         problems=(*problems, *facts.problems),
@@ -379,12 +373,12 @@ def _texts(path: Path, arrays: Mapping[str, NDArray[Any]], key: str) -> tuple[st
 
 
 def _scalar(
-    path: Path, arrays: Mapping[str, NDArray[Any]], key: str, beside: object
+    path: Path, arrays: Mapping[str, NDArray[Any]], key: str, beside: Mapping[str, Any]
 ) -> float | None:
     """Return a positive number that the archive or else its JSON file gives."""
-    value = (
-        arrays[key].item() if key in arrays and arrays[key].size == 1 else arrays.get(key, beside)
-    )
+    value = arrays.get(key, beside.get(key))
+    if key in arrays and arrays[key].size == 1:
+        value = arrays[key].item()
     if value is None or isinstance(value, str):
         return None
     if (
@@ -397,18 +391,24 @@ def _scalar(
     return float(value)
 
 
-def _read_sibling(path: Path) -> tuple[dict[str, Any], tuple[Problem, ...]]:
-    """Return the JSON object beside an archive; a file that cannot be read is a warning, because it
-    is optional."""
-    beside = path.with_suffix(".json")
-    if not beside.is_file():
-        return {}, ()
+def _read_sibling(path: Path) -> tuple[dict[str, Any], list[Problem]]:
+    """Return the JSON object beside an archive, with ``rate`` under this name; a file that cannot
+    be read is a warning, because it is optional, and so is a number that is none."""
+    path = path.with_suffix(".json")
+    if not path.is_file():
+        return {}, []
     try:
-        return read_json_object(beside), ()
+        beside = read_json_object(path)
     except InputError as error:
-        return {}, (
-            Problem("warning", f"{error}; ignored, class names and sampling rate may be missing"),
-        )
+        what = f"{error}; ignored, class names and sampling rate may be missing"
+        return {}, [Problem("warning", what)]
+    beside["full_scale"] = _in_counts(beside.get("full_scale"))
+    beside["rate"] = next((beside[key] for key in _RATES if key in beside), None)
+    return beside, [
+        Problem.warning(path, f"{key} is {shown(beside[key])}, no number: ignored")
+        for key in ("full_scale", "rate")
+        if isinstance(beside[key], str)
+    ]
 
 
 def _in_counts(value: object) -> object:

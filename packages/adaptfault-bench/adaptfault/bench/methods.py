@@ -77,7 +77,7 @@ def of_each_cell(
             f"{name}: {method} returned {cells.dtype} of shape {cells.shape}; expected bool of"
             f" shape ({layout.n_cells},), one value a cell; correct {method}"
         )
-    return np.asarray(cells & layout.present.ravel())
+    return np.asarray(cells & layout.is_cell)
 
 
 class Fitted:

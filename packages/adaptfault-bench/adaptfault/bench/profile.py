@@ -144,9 +144,7 @@ class SensorProfile:
     @property
     def fault_set(self) -> FaultSet:
         """F, the cells of all faults."""
-        return FaultSet(
-            tuple({cell for fault in self.faults for cell in fault.cells}), self.layout.n_cells
-        )
+        return FaultSet.of([c for fault in self.faults for c in fault.cells], self.layout.n_cells)
 
     def apply(self, loads: ArrayLike, *, seed: int | None = None) -> Floats:
         """Return what this sensor reads of the frames of a simulator.

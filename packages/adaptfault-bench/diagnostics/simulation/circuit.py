@@ -233,26 +233,27 @@ class Circuit:
     def _scan(self, wires: _Pad, forces: FloatArray) -> FloatArray:
         """Return the converter's input ``[T, rows, cols]`` for forces of the same shape, as shares
         of the supply."""
-        rows = wires.rows
-        n = len(wires.static)
-        columns = np.arange(rows, rows + forces.shape[2])
         out = np.zeros(forces.shape)
-        step = max(1, _BATCH // n**2)
+        step = max(1, _BATCH // len(wires.static) ** 2)
         for start in range(0, len(forces), step):
             part = slice(start, start + step)
             idle = self._nodal_matrix(wires, forces[part])
             for driven in np.unique(wires.drive):
                 matrix, source = self._driven(wires, idle, int(driven))
-                sides = np.concatenate([source[:, None], np.eye(n)[:, columns]], axis=1)
-                solved = np.linalg.solve(
-                    matrix, np.broadcast_to(sides, (len(matrix), *sides.shape))
-                )
-                own = solved[:, columns, np.arange(1, len(columns) + 1)]  # Z_jj [t, cols]
-                at_load = solved[:, columns, 0] / (1 + self._reading_gain * own)
-                received = np.where(wires.listen >= 0, at_load[:, np.maximum(wires.listen, 0)], 0.0)
+                received = self._received(wires, matrix, source)
                 out[part, wires.drive == driven] = received[:, None]
         out *= self.load_ohms / (self.load_ohms + self.switch_ohms)
         return out
+
+    def _received(self, wires: _Pad, matrix: FloatArray, source: FloatArray) -> FloatArray:
+        """Return what the converter receives of each column, ``[T, cols]``, for Y ``[T, wires,
+        wires]`` and s ``[wires]``."""
+        columns = np.arange(wires.rows, wires.rows + len(wires.listen))
+        sides = np.concatenate([source[:, None], np.eye(len(source))[:, columns]], axis=1)
+        solved = np.linalg.solve(matrix, np.broadcast_to(sides, (len(matrix), *sides.shape)))
+        own = solved[:, columns, np.arange(1, len(columns) + 1)]  # Z_jj [t, cols]
+        at_load = solved[:, columns, 0] / (1 + self._reading_gain * own)
+        return np.where(wires.listen >= 0, at_load[:, np.maximum(wires.listen, 0)], 0.0)
 
     def _nodal_matrix(self, wires: _Pad, forces: FloatArray) -> FloatArray:
         """Return Y ``[T, wires, wires]`` with nothing selected, for forces ``[T, rows, cols]``."""

@@ -67,8 +67,6 @@ def _of_pad(
 ) -> NDArray[np.float64]:
     """Return the converter's input ``[rows, cols]`` of one pad at one level."""
     idle = circuit._nodal_matrix(wires, loads[None])[0]
-    n = len(wires.static)
-    columns = np.arange(wires.rows, wires.rows + loads.shape[1])
     found = np.zeros(loads.shape)
     for row, driven in enumerate(wires.drive.tolist()):
         matrix = idle.copy()
@@ -77,10 +75,5 @@ def _of_pad(
             change = float(level > 0) - float(circuit._grounds("row"))
             matrix[driven, driven] += change / circuit.switch_ohms
             source[driven] += level / circuit.switch_ohms
-        sides = np.concatenate([source[:, None], np.eye(n)[:, columns]], axis=1)
-        solved = np.linalg.solve(matrix, sides)
-        own = solved[columns, np.arange(1, len(columns) + 1)]
-        at_load = solved[columns, 0] / (1 + circuit._reading_gain * own)
-        listened = np.maximum(wires.listen, 0)
-        found[row] = np.where(wires.listen >= 0, at_load[listened], 0.0)
+        found[row] = circuit._received(wires, matrix[None], source)[0]
     return found * circuit.load_ohms / (circuit.load_ohms + circuit.switch_ohms)

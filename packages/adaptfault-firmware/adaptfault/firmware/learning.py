@@ -80,7 +80,7 @@ def learn_limits(diagnoser: SelfDiagnosis, recordings: Sequence[ArrayLike]) -> L
         stuck_after=np.zeros(layout.n_cells, np.uint16),
         predictors=np.zeros((layout.n_cells, PREDICTORS), np.uint16),
     )
-    living = layout.present.ravel() & (reference.dead == 0)
+    living = layout.is_cell & (reference.dead == 0)
     return from_recordings(known, [known.counts(one) for one in frames], layout, living)
 
 

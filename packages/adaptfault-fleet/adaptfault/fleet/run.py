@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from datetime import datetime, timedelta, timezone
 from functools import partial
@@ -13,11 +14,11 @@ from typing import TYPE_CHECKING, Any
 
 from tqdm import tqdm
 
-from adaptfault.bundle.bundle import now
+from adaptfault.bundle.journal import now
 from adaptfault.bundle.lock import locked
 from adaptfault.data.documents import rebuilt
 from adaptfault.data.json_lines import Lines
-from adaptfault.fleet.engines import engine
+from adaptfault.fleet.engines import Engine, engine
 from adaptfault.fleet.guard import Task
 from adaptfault.fleet.listing import Fleet, Robot
 from adaptfault.fleet.outcome import NAMES, Outcome
@@ -64,8 +65,7 @@ def maintain_fleet(
         limit: seconds per robot, after which its process is killed and the robot is an error. None:
             no limit.
         keys, least_serial: whose signature each bundle needs, see :class:`Bundle`. The files must
-        be there on every
-            worker.
+            be there on every worker.
         sign: PEM file of the private key that signs each bundle after its run, with ``keys``; None:
             none is signed.
         progress: show or hide it on stderr; None shows it on a terminal.
@@ -78,48 +78,64 @@ def maintain_fleet(
     """
     from adaptfault.fleet.summary import FleetReport
 
+    _check(jobs, dask, limit, keys, sign)
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    options: dict[str, Any] = {
+        "dry_run": dry_run,
+        "budget": budget,
+        "least_serial": least_serial,
+        "sign": sign,
+        "keys": None if keys is None else list(map(str, keys)),
+    }
+    task = Task(partial(maintain_robot, **options), ready, limit)
+    with locked(folder / "run.lock", patience=0):
+        workers = engine(task, jobs=jobs, dask=dask)
+        began, outcomes = _outcomes(fleet, Lines(folder / LEDGER), options, workers, progress)
+    return FleetReport(outcomes, began, now(), dry_run, fleet.source)
+
+
+def _check(
+    jobs: int | None,
+    dask: str | None,
+    limit: float | None,
+    keys: Sequence[str] | None,
+    sign: str | None,
+) -> None:
     if limit is not None and not limit > 0:
         raise ValueError(f"limit {limit}: expected seconds, more than 0")
     if sign is not None and not keys:  # whatever lies in the bundle would be signed
         raise ValueError("sign needs keys: only a bundle that a trusted key signed is signed again")
-    _check_workers(jobs, dask)
-    folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
-    with locked(folder / "run.lock", patience=0):
-        lines = Lines(folder / LEDGER)
-        options: dict[str, Any] = {
-            "dry_run": dry_run,
-            "budget": budget,
-            "least_serial": least_serial,
-            "sign": sign,
-            "keys": None if keys is None else list(map(str, keys)),
-        }
-        task = Task(partial(maintain_robot, **options), ready, limit)
-        began, done = _resumed(lines, fleet, options)
-        if not done:
-            began = now()
-            lines.begin({"schema": SCHEMA, "options": options, "began": began})
-        left = [robot for robot in fleet.robots if robot.name not in done]
-        hide = None if progress is None else not progress
-        with engine(task, jobs=jobs, dask=dask) as work:
-            every = tqdm(
-                work(left), total=len(fleet), initial=len(done), unit="robot", disable=hide
-            )
-            for outcome in every:
-                lines.add({"time": now(), "outcome": outcome.to_dict()})
-                done[outcome.robot.name] = outcome
-        lines.add({"time": now(), "ended": True})
-    return FleetReport(
-        tuple(done[robot.name] for robot in fleet.robots), began, now(), dry_run, fleet.source
-    )
-
-
-def _check_workers(jobs: int | None, dask: str | None) -> None:
     if jobs is not None and (jobs < 1 or dask is not None):
         raise ValueError(
             f"jobs {jobs}: expected at least 1, and none with a Dask cluster, which has its own"
             " workers"
         )
+
+
+def _outcomes(
+    fleet: Fleet,
+    lines: Lines,
+    options: dict[str, Any],
+    workers: AbstractContextManager[Engine],
+    progress: bool | None,
+) -> tuple[str, tuple[Outcome, ...]]:
+    """Return when the run began, and the outcome of each robot, those of a run that is resumed
+    among them."""
+    began, done = _resumed(lines, fleet, options)
+    if not done:
+        began = now()
+        lines.begin({"schema": SCHEMA, "options": options, "began": began})
+    left = [robot for robot in fleet.robots if robot.name not in done]
+    hide = None if progress is None else not progress
+    with workers as work:
+        for outcome in tqdm(
+            work(left), total=len(fleet), initial=len(done), unit="robot", disable=hide
+        ):
+            lines.add({"time": now(), "outcome": outcome.to_dict()})
+            done[outcome.robot.name] = outcome
+    lines.add({"time": now(), "ended": True})
+    return began, tuple(done[robot.name] for robot in fleet.robots)
 
 
 @dataclass(frozen=True)

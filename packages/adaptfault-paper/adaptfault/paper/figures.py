@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from adaptfault.paper.ledger import Ledger, Mean, mean
 from adaptfault.paper.settings import WIRING, Task, is_aware
 from diagnostics import SensorLayout
-from diagnostics.decision.plot import draw_forces, pads_figure
+from diagnostics.decision.plot import draw_row, pads_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -200,14 +200,10 @@ def force_maps(
         maps[f"{len(cells)} {name}"] = normal.copy()
         maps[f"{len(cells)} {name}"][cells] = value
     figure, axes = pads_figure(layout, n_rows=len(maps))
-    size = layout.rows * layout.shape[2]
     # One scale from the healthy map; shorts exceed it.
     top = float(normal[present].max()) or layout.full_scale
     for i, (name, values) in enumerate(maps.items()):
-        masked = layout.grid(np.where(layout.present.ravel(), values, np.nan))
-        for pad, ax in enumerate(axes[i]):
-            dead = [int(c) % size for c in cells if i and c // size == pad]
-            image = draw_forces(ax, masked[pad], layout, dead, vmin=0, vmax=top, cmap="viridis")
-            ax.set_title(f"{name}, pad {pad}", fontsize=9)
-        figure.colorbar(image, ax=axes[i].tolist(), label=layout.unit, extend="max")
+        dead = cells.tolist() if i else []
+        title = f"{name}, "
+        draw_row(axes[i], values, layout, title, dead, top=top, label=layout.unit, extend="max")
     return figure, maps

@@ -129,7 +129,7 @@ class AgeingTable:
     def _series(self) -> tuple[list[Series], Floats, Floats, Floats]:
         """Return the series of the sensor, its lines and cells, with values ``[n, m]`` and limits
         ``[m]``."""
-        present = self.layout.present.ravel()
+        present = self.layout.is_cell
         # A fault is an event and not a trend: the values of a faulty cell are left out.
         values = np.where(
             (self.verdicts == Verdict.FAULTY)[:, None] | ~present, np.nan, self.values

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import logging
 import os
-import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from time import monotonic
 from typing import TYPE_CHECKING, Any
 
+from adaptfault.bundle.journal import NAME as JOURNAL
+from adaptfault.bundle.pointer import NAME as POINTER
 from adaptfault.bundle.pointer import file_stamp
+from adaptfault.bundle.reload import Reload
 from diagnostics import FaultSet, SelfDiagnosis, SensorLayout
 
 if TYPE_CHECKING:
@@ -19,8 +20,6 @@ if TYPE_CHECKING:
     from adaptfault.bundle.versions import Version
     from adaptfault.data.calibration import Calibration
     from adaptfault.imputation.restorer import Restorer
-
-_RETRY = 60.0  # seconds until the next attempt after the bundle could not be read
 
 _log = logging.getLogger(__name__)
 
@@ -116,7 +115,6 @@ class Follower:
     Args:
         load: returns the sensor; argument: the one before, None at first.
         path: of the bundle; None: there is none, and nothing changes.
-        clock: seconds.
 
     Attributes:
         sensor: as loaded last.
@@ -126,61 +124,28 @@ class Follower:
     """
 
     def __init__(
-        self,
-        load: Callable[[Sensor | None], Sensor],
-        path: str | os.PathLike[str] | None,
-        clock: Callable[[], float] = monotonic,
+        self, load: Callable[[Sensor | None], Sensor], path: str | os.PathLike[str] | None
     ) -> None:
-        self.path = None if path is None else Path(path)
-        self.clock = clock
         self._load = load
-        self._stamp = self._look()
+        self._files = () if path is None else tuple(Path(path, name) for name in (POINTER, JOURNAL))
+        self.reload = Reload(self._load_again, self._look)
         self.sensor = load(None)
-        self._next_look = clock()
-        self._loading: threading.Thread | None = None
-        self._ready: Sensor | None = None
 
     def poll(self) -> Sensor | None:
         """Return the sensor as the bundle states it now, once after each change; never waits."""
-        if self.path is None:
-            return None
-        if self._loading is not None:
-            if self._loading.is_alive():
-                return None
-            self._loading = None
-            ready = self._ready
-            self._ready = None
-            if ready is not None:
-                self.sensor = ready
-                return ready
-        if self.clock() < self._next_look:
-            return None
-        stamp = self._look()
-        if stamp != self._stamp:
-            self._stamp = stamp
-            self._loading = threading.Thread(
-                target=self._load_again, name="adaptfault-load", daemon=True
-            )
-            self._loading.start()
-        return None
+        ready = self.reload.poll(self.sensor)
+        if ready is not None:
+            self.sensor = ready
+        return ready
 
-    def _look(self) -> tuple[object, ...]:
+    def _look(self) -> tuple[object, ...] | None:
         """Return what changes where a version is deployed, or known faults are written."""
-        from adaptfault.bundle.journal import NAME as JOURNAL
-        from adaptfault.bundle.pointer import NAME as POINTER
+        return tuple(map(file_stamp, self._files)) or None
 
-        if self.path is None:
-            return ()
-        return tuple(file_stamp(self.path / name) for name in (POINTER, JOURNAL))
-
-    def _load_again(self) -> None:
+    def _load_again(self, before: Sensor) -> Sensor:
         try:
-            self._ready = self._load(self.sensor)
+            return self._load(before)
         except Exception as error:  # whatever it is, what runs goes on with what it has
-            self._stamp = ()
-            self._next_look = self.clock() + _RETRY
-            _log.warning(
-                "%s could not be read, all goes on as before: %s",
-                self.path,
-                error,
-            )
+            what = "could not be read, all goes on as before"
+            _log.warning("%s %s: %s", self._files[0].parent, what, error)
+            raise

@@ -195,7 +195,7 @@ class _Device:
         """State what an evaluation found, and all cells that are taken for faulty now."""
         if diagnosis is None:
             states = np.full(layout.n_cells, State.UNTESTED, dtype=np.uint8)
-            states[~layout.present.ravel()] = State.NO_CELL
+            states[~layout.is_cell] = State.NO_CELL
             self.status = stale_array(
                 layout, "not evaluated yet", level=Level.WARN, hardware_id=self.name
             )

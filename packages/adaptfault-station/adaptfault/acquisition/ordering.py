@@ -4,7 +4,7 @@ device."""
 from __future__ import annotations
 
 from bisect import insort
-from collections import deque
+from collections import Counter, deque
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -107,28 +107,16 @@ class Ordering:
         self._held: list[_Waiting] = []
         self._stray: _Waiting | None = None
         self._seen: deque[float] = deque(maxlen=_REMEMBERED)
-        self._received = self._kept = self._duplicates = self._late = self._strays = self._lost = (
-            self._restarts
-        ) = 0
+        self._counts: Counter[str] = Counter()
 
     @property
     def arrivals(self) -> Arrivals:
         """Counts so far."""
-        held = len(self._held) + (self._stray is not None)
-        return Arrivals(
-            self._received,
-            self._kept,
-            self._duplicates,
-            self._late,
-            self._strays,
-            held,
-            self._lost,
-            self._restarts,
-        )
+        return Arrivals(held=len(self._held) + (self._stray is not None), **self._counts)
 
     def push(self, packet: Packet, now: float) -> list[Frame]:
         """Add a packet that arrived at ``now`` (seconds); return the frames that are ready."""
-        self._received += 1
+        self._counts["received"] += 1
         return self._place(_Waiting(packet.time, packet, now))
 
     def overdue(self, now: float) -> list[Frame]:
@@ -144,7 +132,7 @@ class Ordering:
         """Return all held frames; call at the end."""
         if self._stray is not None:
             self._stray = None
-            self._strays += 1
+            self._counts["strays"] += 1
         return self._release_held()
 
     def _place(self, one: _Waiting) -> list[Frame]:
@@ -152,13 +140,13 @@ class Ordering:
             return [self._release(one)]
         waiting = self._held if self._stray is None else [*self._held, self._stray]
         if one.time in self._seen or any(one.time == other.time for other in waiting):
-            self._duplicates += 1
+            self._counts["duplicates"] += 1
             return []
         step = one.time - self._last
         if not -_LATE <= step <= _FAR:
             return self._handle_jump(one)
         if step <= 0:
-            self._late += 1
+            self._counts["late"] += 1
             return []
         insort(self._held, one)
         frames = self._release_following()
@@ -173,14 +161,14 @@ class Ordering:
         if one.time < (self._last or 0.0) and (
             not self.restarts or one.arrived - self._arrived < quiet
         ):
-            self._strays += 1
+            self._counts["strays"] += 1
             return []
         other = self._stray
         self._stray = one
         if other is None:
             return []
         if abs(one.time - other.time) > _FAR:
-            self._strays += 1
+            self._counts["strays"] += 1
             return []
         self._stray = None
         frames = self._release_held()
@@ -206,7 +194,7 @@ class Ordering:
     def _release(self, one: _Waiting, *, restarted: bool = False) -> Frame:
         lost = 0
         if restarted and self._last is not None:
-            self._restarts += 1
+            self._counts["restarts"] += 1
             self._seen.clear()
             # Only the receiver's clock measures the duration of the restart.
             away = max(one.arrived - self._arrived, 1 / self.rate)
@@ -216,8 +204,8 @@ class Ordering:
         self._last = one.time
         self._arrived = one.arrived
         self._seen.append(one.time)
-        self._lost += lost
-        self._kept += 1
+        self._counts["lost"] += lost
+        self._counts["kept"] += 1
         packet = one.packet
         at = one.time + self._offset
         return Frame(self.device, at, packet.values, lost, restarted, packet.scan)

@@ -5,12 +5,13 @@ from __future__ import annotations
 import asyncio
 import socket
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Collection, Iterable
 from contextlib import suppress
-from dataclasses import dataclass, fields
+from dataclasses import asdict, dataclass
 from ipaddress import ip_address
 from types import TracebackType
+from typing import Any
 
 from adaptfault.acquisition.clock import ClockCheck
 from adaptfault.acquisition.ordering import WINDOW, Arrivals, Frame, Ordering
@@ -72,7 +73,7 @@ class Counters:
     restarts: int = 0
 
     def __str__(self) -> str:
-        counts = {f.name: getattr(self, f.name) for f in fields(self)}
+        counts = asdict(self)
         received = counts.pop("received")
         outside = {name: counts.pop(name) for name in _OUTSIDE}
         kept = f"{counts.pop('kept')} kept"
@@ -86,10 +87,182 @@ class Counters:
 
     def to_dict(self) -> dict[str, int]:
         """Return a JSON-safe dict."""
-        return {f.name: getattr(self, f.name) for f in fields(self)}
+        return asdict(self)
 
 
-class Receiver(asyncio.DatagramProtocol):
+class _Oversized(PacketError):
+    """A datagram that is longer than any packet of the array."""
+
+
+_REFUSED: dict[type[PacketError], str] = {_Oversized: "oversized", NotAuthentic: "forged"}
+
+
+class _Dropping:
+    """Tells the first datagram that is no packet of this array; later ones are told together."""
+
+    def __init__(self, on_trouble: Callable[[str, str], None] | None) -> None:
+        self._on_trouble = on_trouble
+        self._told: float | None = None  # when the last line was told
+        self._untold = 0  # such packets since then
+        self._last = ""
+
+    def tell(self, problem: str, now: float, sender: str) -> None:
+        """Tell a datagram at ``now``, seconds, from an address."""
+        if self._on_trouble is None:
+            return
+        self._last = f"{problem}{f' (from {sender})' if sender else ''}"
+        if self._told is None:
+            self._told = now
+            self._on_trouble("", f"a packet is dropped: {self._last}")
+            return
+        self._untold += 1
+        self.tell_more(now)
+
+    def tell_more(self, now: float) -> None:
+        """Tell how many came since the last line, if that was long ago."""
+        if not self._untold or self._told is None or now - self._told < _TELL:
+            return
+        assert self._on_trouble is not None
+        packets = "packet is" if self._untold == 1 else "packets are"
+        self._on_trouble("", f"{self._untold} more {packets} dropped, the last: {self._last}")
+        self._told = now
+        self._untold = 0
+
+
+@dataclass
+class _Device:
+    """A device that sends: its packets in their order, its clock, its address, and when it sent
+    last."""
+
+    stream: Ordering
+    clock: ClockCheck
+    address: str
+    last: float
+
+
+class Intake:
+    """Makes datagrams of one kind of array frames that wait to be fetched; see :class:`Receiver`
+    for the arguments."""
+
+    def __init__(
+        self,
+        layout: SensorLayout,
+        *,
+        ticks: float = TICKS,
+        devices: Collection[str] | None = None,
+        most_devices: int = MOST_DEVICES,
+        queue: int = QUEUE,
+        window: int = WINDOW,
+        key: bytes | None = None,
+        on_frame: Callable[[Frame], None] | None = None,
+        on_trouble: Callable[[str, str], None] | None = None,
+    ) -> None:
+        self.layout = layout
+        self.ticks = ticks
+        self.on_frame = on_frame
+        self.on_trouble = on_trouble
+        self.devices = None if devices is None else dict(map(_device, devices))
+        self.most_devices = most_devices
+        self.window = window
+        self.key = key
+        self._queue: deque[Frame] = deque(maxlen=queue)
+        self._devices: dict[str, _Device] = {}
+        self._counts: Counter[str] = Counter()  # those of devices that are forgotten among them
+        self._dropping = _Dropping(on_trouble)
+
+    @property
+    def counters(self) -> Counters:
+        """Counts of all datagrams so far."""
+        total = self._counts.copy()
+        for device in self._devices.values():
+            total.update(_beside_received(device))
+        total["kept"] -= total["dropped"]
+        return Counters(devices=len(self._devices), **total)
+
+    @property
+    def arrivals(self) -> dict[str, Arrivals]:
+        """Counts of the packets of each device."""
+        return {name: device.stream.arrivals for name, device in self._devices.items()}
+
+    def take(self, data: bytes, now: float, sender: str = "") -> None:
+        """Process one datagram that arrived at ``now``, seconds of a monotonic clock, from the
+        address ``sender``.
+
+        A device is bound to the address that it sends from first: packets with its name from other
+        addresses are refused until it has been silent for 10 s.
+        """
+        self._counts["received"] += 1
+        longest = longest_packet(self.layout.n_cells)
+        try:
+            if len(data) > longest:
+                raise _Oversized(f"{len(data)} bytes, expected {longest} at most")
+            packet = parse_packet(data, self.layout.n_cells, ticks=self.ticks, key=self.key)
+        except PacketError as error:
+            self._counts[_REFUSED.get(type(error), "malformed")] += 1
+            self._dropping.tell(str(error), now, sender)
+            return
+        device = self._device_of(packet.device, now, sender)
+        if device is None:
+            self._counts["refused"] += 1
+            return
+        device.address = sender
+        device.last = now
+        problem = device.clock.push(packet.time, now)
+        if problem and self.on_trouble is not None:
+            self.on_trouble(packet.device, problem)
+        self._put(device.stream.push(packet, now))
+
+    def _device_of(self, name: str, now: float, sender: str) -> _Device | None:
+        """Return the device that sends from an address; None: its packets are refused."""
+        if self.devices is not None and self.devices.get(name, "none") not in (None, sender):
+            return None
+        device = self._devices.get(name)
+        if device is not None:
+            return device if sender == device.address or now - device.last >= _BOUND else None
+        if len(self._devices) >= self.most_devices and not self._evict(now):
+            return None
+        rate = self.layout.rate
+        stream = Ordering(name, rate, window=self.window, restarts=self.key is None)
+        self._devices[name] = _Device(stream, ClockCheck(self.ticks), sender, now)
+        return self._devices[name]
+
+    def _evict(self, now: float) -> bool:
+        """Forget the device that has been silent longest; return whether there was one."""
+        name = min(self._devices, key=lambda one: self._devices[one].last)
+        if now - self._devices[name].last < _IDLE:
+            return False
+        device = self._devices.pop(name)
+        self._put(device.stream.flush())
+        self._counts.update(_beside_received(device))
+        return True
+
+    def discard(self) -> None:
+        """Drop the frames that wait to be fetched."""
+        self._counts["dropped"] += len(self._queue)
+        self._queue.clear()
+
+    def poll(self, now: float) -> None:
+        """Release packets whose waiting time for an earlier one is over."""
+        for device in self._devices.values():
+            self._put(device.stream.overdue(now))
+        self._dropping.tell_more(now)
+
+    def _put(self, frames: Iterable[Frame]) -> None:
+        for frame in frames:
+            if self.on_frame is not None:
+                self.on_frame(frame)
+            self._counts["dropped"] += len(self._queue) == self._queue.maxlen
+            self._queue.append(frame)
+
+
+def _beside_received(device: _Device) -> dict[str, int]:
+    """Return the counts of the packets of a device; all datagrams are counted as they come."""
+    counts = asdict(device.stream.arrivals)
+    del counts["received"]
+    return counts
+
+
+class Receiver(Intake, asyncio.DatagramProtocol):
     """Frames of one kind of array from the network:
     ``async with Receiver(layout, port) as r: async for frame in r:``.
 
@@ -123,173 +296,20 @@ class Receiver(asyncio.DatagramProtocol):
     """
 
     def __init__(
-        self,
-        layout: SensorLayout,
-        port: int = 0,
-        *,
-        host: str = "127.0.0.1",
-        ticks: float = TICKS,
-        devices: Collection[str] | None = None,
-        most_devices: int = MOST_DEVICES,
-        queue: int = QUEUE,
-        window: int = WINDOW,
-        key: bytes | None = None,
-        on_frame: Callable[[Frame], None] | None = None,
-        on_trouble: Callable[[str, str], None] | None = None,
+        self, layout: SensorLayout, port: int = 0, *, host: str = "127.0.0.1", **options: Any
     ) -> None:
-        self.layout = layout
+        super().__init__(layout, **options)
         self.port = port
         self.host = host
-        self.ticks = ticks
-        self.on_frame = on_frame
-        self.on_trouble = on_trouble
-        self.devices = None if devices is None else dict(map(_device, devices))
-        self.most_devices = most_devices
-        self.window = window
-        self.key = key
-        self._queue: deque[Frame] = deque(maxlen=queue)
-        self._longest = longest_packet(layout.n_cells)
-        self._streams: dict[str, Ordering] = {}
-        self._clocks: dict[str, ClockCheck] = {}
-        self._senders: dict[
-            str, tuple[str, float]
-        ] = {}  # address of each device, and when it sent last
-        # counts of devices that are forgotten
-        self._evicted = dict.fromkeys((f.name for f in fields(Arrivals)), 0)
-        self._received = self._dropped = self._malformed = self._oversized = self._forged = (
-            self._refused
-        ) = 0
-        self._told: float | None = None  # when a packet was told that is none of this array
-        self._untold = 0  # such packets since then
-        self._last_problem = ""
         self._transport: asyncio.BaseTransport | None = None
         self._news = asyncio.Event()
         self._closed = False
         self._ticker: asyncio.Task[None] | None = None
 
     @property
-    def counters(self) -> Counters:
-        """Counts of all datagrams so far."""
-        each = [stream.arrivals for stream in self._streams.values()]
-        total = {
-            f.name: self._evicted[f.name] + sum(getattr(one, f.name) for one in each)
-            for f in fields(Arrivals)
-            if f.name != "received"
-        }
-        total["kept"] -= self._dropped
-        return Counters(
-            received=self._received,
-            dropped=self._dropped,
-            malformed=self._malformed,
-            oversized=self._oversized,
-            forged=self._forged,
-            refused=self._refused,
-            devices=len(each),
-            **total,
-        )
-
-    @property
-    def arrivals(self) -> dict[str, Arrivals]:
-        """Counts of the packets of each device."""
-        return {name: stream.arrivals for name, stream in self._streams.items()}
-
-    def take(self, data: bytes, now: float, sender: str = "") -> None:
-        """Process one datagram that arrived at ``now``, seconds of a monotonic clock, from the
-        address ``sender``.
-
-        A device is bound to the address that it sends from first: packets with its name from other
-        addresses are refused until it has been silent for 10 s.
-        """
-        self._received += 1
-        if len(data) > self._longest:
-            self._oversized += 1
-            self._tell(f"{len(data)} bytes, expected {self._longest} at most", now, sender)
-            return
-        try:
-            packet = parse_packet(data, self.layout.n_cells, ticks=self.ticks, key=self.key)
-        except NotAuthentic as error:
-            self._forged += 1
-            self._tell(str(error), now, sender)
-            return
-        except PacketError as error:
-            self._malformed += 1
-            self._tell(str(error), now, sender)
-            return
-        if self.devices is not None and self.devices.get(packet.device, "none") not in (
-            None,
-            sender,
-        ):
-            self._refused += 1
-            return
-        stream = self._streams.get(packet.device)
-        if stream is None:
-            if len(self._streams) >= self.most_devices and not self._evict(now):
-                self._refused += 1
-                return
-            stream = self._streams[packet.device] = Ordering(
-                packet.device, self.layout.rate, window=self.window, restarts=self.key is None
-            )
-            self._clocks[packet.device] = ClockCheck(self.ticks)
-        bound, last = self._senders.get(packet.device, (sender, now))
-        if sender != bound and now - last < _BOUND:
-            self._refused += 1
-            return
-        self._senders[packet.device] = (sender, now)
-        problem = self._clocks[packet.device].push(packet.time, now)
-        if problem and self.on_trouble is not None:
-            self.on_trouble(packet.device, problem)
-        self._put(stream.push(packet, now))
-
-    def _tell(self, problem: str, now: float, sender: str) -> None:
-        """Tell the first datagram that is no packet of this array; later ones are told together."""
-        if self.on_trouble is None:
-            return
-        self._last_problem = f"{problem}{f' (from {sender})' if sender else ''}"
-        if self._told is None:
-            self._told = now
-            self.on_trouble("", f"a packet is dropped: {self._last_problem}")
-            return
-        self._untold += 1
-        self._tell_more(now)
-
-    def _tell_more(self, now: float) -> None:
-        if not self._untold or self._told is None or now - self._told < _TELL:
-            return
-        assert self.on_trouble is not None
-        packets = "packet is" if self._untold == 1 else "packets are"
-        self.on_trouble(
-            "", f"{self._untold} more {packets} dropped, the last: {self._last_problem}"
-        )
-        self._told = now
-        self._untold = 0
-
-    def _evict(self, now: float) -> bool:
-        """Forget the device that has been silent longest; return whether there was one."""
-        name = min(self._senders, key=lambda one: self._senders[one][1])
-        if now - self._senders[name][1] < _IDLE:
-            return False
-        stream = self._streams.pop(name)
-        del self._senders[name], self._clocks[name]
-        self._put(stream.flush())
-        for count in self._evicted:
-            self._evicted[count] += getattr(stream.arrivals, count)
-        return True
-
-    def discard(self) -> None:
-        """Drop the frames that wait to be fetched."""
-        self._dropped += len(self._queue)
-        self._queue.clear()
-
-    @property
     def closed(self) -> bool:
         """Whether it no longer listens."""
         return self._closed
-
-    def poll(self, now: float) -> None:
-        """Release packets whose waiting time for an earlier one is over."""
-        for stream in self._streams.values():
-            self._put(stream.overdue(now))
-        self._tell_more(now)
 
     def close(self) -> None:
         """Stop listening. Received frames can still be fetched; then the iteration ends."""
@@ -300,8 +320,8 @@ class Receiver(asyncio.DatagramProtocol):
             self._ticker.cancel()
         if self._transport is not None:
             self._transport.close()
-        for stream in self._streams.values():
-            self._put(stream.flush())
+        for device in self._devices.values():
+            self._put(device.stream.flush())
         self._news.set()
 
     async def __aenter__(self) -> Receiver:
@@ -357,11 +377,8 @@ class Receiver(asyncio.DatagramProtocol):
             self.poll(time.monotonic())
 
     def _put(self, frames: Iterable[Frame]) -> None:
-        for frame in frames:
-            if self.on_frame is not None:
-                self.on_frame(frame)
-            self._dropped += len(self._queue) == self._queue.maxlen
-            self._queue.append(frame)
+        super()._put(frames)
+        if self._queue:
             self._news.set()
 
 

@@ -135,11 +135,10 @@ class Session:
         self.clock = clock
         self.accumulate = accumulate
         self.switch = None if rule is None else Switch(rule)
-        self.label: Any = None
-        self.classes: tuple[int, ...] | None = None
+        self.told: tuple[Any, Any] = (None, None)  # class and set of classes
         self.faults: tuple[Fault, ...] = ()
         self._classified = 0
-        self._confirmed = self._confirm_failed = False
+        self._confirmed: bool | None = None  # None: not tried yet
         self._faulty: NDArray[np.bool_] | None = None
         self.time = 0.0  # of the last frame
         self._arrived: float | None = None
@@ -152,7 +151,7 @@ class Session:
     def fault_set(self) -> FaultSet:
         """The cells that the monitor finds faulty now."""
         assert self._faulty is not None  # after the first frame
-        return FaultSet(tuple(np.flatnonzero(self._faulty).tolist()), self._faulty.size)
+        return FaultSet.of(self._faulty, self._faulty.size)
 
     def take(self, frame: Frame, now: float) -> list[Event]:
         """Process a frame that arrived at ``now`` (seconds of the receiver's clock); return its
@@ -254,14 +253,13 @@ class Session:
             probabilities = getattr(reading, "contact", None)
             decided = None if probabilities is None else int(np.argmax(probabilities))
         classes = getattr(reading, "classes", None)
-        if decided == self.label and classes == self.classes:
+        if (decided, classes) == self.told:
             return events
-        self.label = decided
-        self.classes = classes
+        self.told = decided, classes
         if decided is None:  # the contact has ended
             return events
         share = float(np.max(probabilities))
-        label = self.label.item() if isinstance(self.label, np.generic) else self.label
+        label = decided.item() if isinstance(decided, np.generic) else decided
         names = getattr(self.watcher, "class_names", ())
         text = f"{names[label] if names else label} ({share:.0%})"
         data = {"label": label, "probability": share, "dropped": len(reading.fault_set)}
@@ -275,6 +273,8 @@ class Session:
         """Confirm the running version; a failure is reported once and repeated after as many
         windows."""
         assert not isinstance(self.watcher, Monitor)
+        first = self._confirmed is None
+        self._confirmed = False
         try:
             self._confirmed = self.watcher.confirm() is not False
             problem = "another version is active, or the bundle cannot be written"
@@ -282,8 +282,6 @@ class Session:
             problem = str(error)
         if self._confirmed:
             return [self._event("confirmed", f"{self._classified} windows classified")]
-        first = not self._confirm_failed
-        self._confirm_failed = True
         return [self._event("trouble", f"the version is not confirmed: {problem}")] if first else []
 
     def _record(self, frame: Frame) -> list[Event]:

@@ -21,20 +21,17 @@ from adaptfault.acquisition.newcomers import Newcomers
 from adaptfault.acquisition.ordering import Frame
 from adaptfault.acquisition.packet import TICKS
 from adaptfault.acquisition.receiver import Receiver
-from adaptfault.acquisition.recorder import Recorder
 from adaptfault.acquisition.relay import FrameRepair, Relay, parse_address
-from adaptfault.acquisition.scanning import Scans
-from adaptfault.acquisition.session import Event, Session, StreamingPredictor
-from adaptfault.acquisition.switch import Rule, parse_when
+from adaptfault.acquisition.session import Event, Session
+from adaptfault.acquisition.sessions import Sessions
 from adaptfault.data.printable import printable
 from adaptfault.inspection.converter_range import within_range
 from adaptfault.robot.metrics import RobotMetrics, cells_by_pad, fault_counts, write_metrics
-from diagnostics import FaultSet, Monitor, SelfDiagnosis, SensorLayout
+from diagnostics import SensorLayout
 
 if TYPE_CHECKING:
     from adaptfault.acquisition.live import LiveView
     from adaptfault.data.calibration import Calibration
-    from adaptfault.imputation.restorer import Restorer
 
 SCHEMA = "adaptfault.listen/1"
 
@@ -113,63 +110,35 @@ class Station:
         as_json: bool = False,
         quiet: bool = False,
     ) -> None:
-        self.bundle = bundle
-        self.record = record
         self.calibration = calibration
         self.metrics = metrics
-        self._keys = keys
-        self._least_serial = least_serial
         self.seconds = seconds
         self.frames = frames
-        self.as_json = as_json
         self.quiet = quiet
+        self.as_json = as_json
         self.on_event = self._print if on_event is None else on_event
-        self.accumulate = accumulate
-        self.sets = sets
-        self.lines_held = lines_held
-        if accumulate and bundle is None:
-            raise ValueError("--accumulate needs BUNDLE: classes are accumulated over a contact")
-        if sets is not None and bundle is None:
-            raise ValueError("--sets needs BUNDLE: its model classifies the windows")
-        if sets is not None and accumulate:
-            raise ValueError("--sets are of windows, --accumulate is of contacts: give one of them")
-        self._ready: list[StreamingPredictor | Monitor] = []
-        if bundle is not None:
-            predictor = self._predictor()
-            layout = predictor.layout
-            self._ready.append(predictor)
-        if layout is None:
-            raise ValueError("the array is unknown: give a layout or a bundle")
+        trust = {"keys": keys, "least_serial": least_serial}
+        self._sessions = Sessions(
+            layout, bundle, trust, record, when, accumulate, sets, lines_held, self._say
+        )
+        self.layout = self._sessions.layout
         if calibration is not None:
-            calibration.check(layout)
-        self.layout = layout
-        self._rule: Rule | None = None if record is None else parse_when(when, layout)
-        if record is not None:
-            with Recorder(record, layout):  # a folder that cannot be used raises now
-                pass
-        self._restoring: tuple[Restorer, FaultSet] | None = None
+            calibration.check(self.layout)
         self._relay = None if relay is None else self._make_relay(relay, host, port, ticks)
         self._view = None if view is None else self._make_view(view)
-        if not self._ready:
-            self._ready.append(self._monitor())  # takes a second, so before the first frame
-        self._first = self._ready[0]
-        queue = max(64, _WAITING // (8 * layout.n_cells))
-        send = None if self._relay is None else self._send
         self.receiver = Receiver(
-            layout,
+            self.layout,
             port,
             host=host,
             devices=devices,
             ticks=ticks,
-            queue=queue,
+            queue=max(64, _WAITING // (8 * self.layout.n_cells)),
             key=key,
-            on_frame=send,
+            on_frame=None if self._relay is None else self._send,
             on_trouble=self._trouble,
         )
-        self._newcomers = Newcomers(layout.rate, self.receiver.devices)
-        self._sessions: dict[str, Session] = {}
+        self._newcomers = Newcomers(self.layout.rate, self.receiver.devices)
         self._outside = 0  # readings outside the layout's range
-        self._command: bool | None = None  # the last command, also for devices that come later
 
     async def listen(self) -> None:
         """Listen until stopped.
@@ -201,7 +170,7 @@ class Station:
                     looking.cancel()
             self.receiver.discard()  # what the number of frames left over
         finally:
-            for session in self._sessions.values():
+            for session in self._sessions.of.values():
                 self._emit(session.finish())
             if self._relay is not None:
                 self._relay.close()
@@ -227,14 +196,14 @@ class Station:
         while True:
             await asyncio.sleep(_CHECK)
             now = time.monotonic()
-            for name, session in self._sessions.items():
+            for name, session in self._sessions.of.items():
                 events = session.idle(now)
                 self._emit(events)
                 if events:
                     self._show(name, methodcaller("tell", name, events))
 
     def _take(self, frame: Frame) -> None:
-        session = self._sessions.get(frame.device)
+        session = self._sessions.of.get(frame.device)
         if session is not None:
             self._process(session, frame)
             return
@@ -245,20 +214,18 @@ class Station:
             self._trouble("", unwatched)
         proven = self._newcomers.take(frame, now)
         if proven:
-            self._forget(self._sessions.keys() - sending)
+            self._forget(self._sessions.of.keys() - sending)
             self._watch(proven)
 
     def _watch(self, frames: Sequence[Frame]) -> None:
         """Process frames of devices that may be new."""
         for frame in frames:
-            if frame.device not in self._sessions:
-                self._sessions[frame.device] = self._begin(frame.device)
-            self._process(self._sessions[frame.device], frame)
+            self._process(self._sessions.begun(frame.device), frame)
 
     def _forget(self, devices: Collection[str]) -> None:
         """End the sessions of devices that the receiver has forgotten."""
         for gone in devices:
-            self._emit(self._sessions.pop(gone).finish())
+            self._emit(self._sessions.of.pop(gone).finish())
             self._show(gone, methodcaller("forget", gone))
 
     def _process(self, session: Session, frame: Frame) -> None:
@@ -297,7 +264,7 @@ class Station:
             self._trouble("", f"the view is not complete: {error}")
 
     def _trouble(self, device: str, text: str) -> None:
-        session = self._sessions.get(device)
+        session = self._sessions.of.get(device)
         at = 0.0 if session is None else session.time
         self.on_event(Event("trouble", device or "station", at, text, clock=datetime.now()))
 
@@ -314,7 +281,7 @@ class Station:
                 pads=cells_by_pad(self.layout, session.faults),
                 faults=fault_counts(session.faults),
             )
-            for name, session in self._sessions.items()
+            for name, session in self._sessions.of.items()
         ]
         try:
             write_metrics(self.metrics, robots)
@@ -327,8 +294,8 @@ class Station:
         assert self._relay is not None  # for the type checker
         if frame.scan is not None:
             return  # no readings
-        session = self._sessions.get(frame.device)
-        watcher = self._first if session is None else session.watcher
+        session = self._sessions.of.get(frame.device)
+        watcher = self._sessions.first if session is None else session.watcher
         whole, _ = self._in_unit(frame)
         self._relay.send(
             frame.device, frame.time, frame.values, whole.values, getattr(watcher, "running", None)
@@ -343,95 +310,32 @@ class Station:
         values, outside = within_range(values, self.layout)
         return replace(frame, values=values), outside
 
-    def _begin(self, device: str) -> Session:
-        recorder = None if self.record is None else Recorder(self.record, self.layout, device)
-        session = Session(
-            device,
-            self._watcher(),
-            recorder=recorder,
-            rule=self._rule,
-            accumulate=self.accumulate,
-            scans=Scans(self.layout, self.lines_held),
-        )
-        session.command(self._command)
-        return session
-
-    def _watcher(self) -> StreamingPredictor | Monitor:
-        """Return what watches one more device; nothing is read for it in the loop."""
-        if self._ready:
-            return self._ready.pop()
-        if isinstance(self._first, Monitor):
-            return self._monitor()
-        return self._first.sibling()
-
-    def _monitor(self) -> Monitor:
-        return Monitor(SelfDiagnosis(self.layout))
-
-    def _predictor(self) -> StreamingPredictor:
-        # imported here, because monitoring alone needs no model
-        from adaptfault.prediction.predictor import (
-            Predictor,
-        )
-
-        assert self.bundle is not None
-        try:
-            return Predictor.load(
-                self.bundle,
-                keys=self._keys,
-                least_serial=self._least_serial,
-                accumulate=self.accumulate,
-                sets=self.sets,
-            )
-        except ImportError as error:
-            raise ValueError(
-                f"{self.bundle}: classifying needs {error.name}; install it, or give no bundle"
-            ) from None
-
     def _make_relay(self, address: str, host: str, port: int, ticks: float) -> Relay:
-        if self.bundle is None:
+        if self._sessions.bundle is None:
             raise ValueError("--relay needs a bundle: cells are restored with its healthy windows")
         if parse_address(address) == (host, port):
             raise ValueError(
                 f"--relay {address}: this address is listened on; give the consumer another port"
             )
-        restorer, known = self._restored()
-        return Relay(address, restorer, known, calibration=self.calibration, ticks=ticks)
+        return Relay(address, *self._sessions.restoring, calibration=self.calibration, ticks=ticks)
 
     def _make_view(self, target: str) -> LiveView:
         from adaptfault.acquisition.live import LiveView
 
         repair = None
-        if self.bundle is not None:
-            repair = partial(FrameRepair, *self._restored())
+        if self._sessions.bundle is not None:
+            repair = partial(FrameRepair, *self._sessions.restoring)
         view = LiveView(target, self.layout, repair)
         self._say(f"view: {view.places[0]}")
         return view
-
-    def _restored(self) -> tuple[Restorer, FaultSet]:
-        """Return what restores frames, fitted once, and the cells that are faulty from the
-        start."""
-        if self._restoring is None:
-            from adaptfault.bundle.bundle import Bundle
-
-            assert self.bundle is not None
-            bundle = Bundle.open(self.bundle, keys=self._keys, least_serial=self._least_serial)
-            known = bundle.known_faults().fault_set
-            self._say(
-                f"restoring: fitting on the healthy windows of {self.bundle}; {len(known)} faulty"
-                " cells known"
-            )
-            self._restoring = (bundle.restorer(), known)
-        return self._restoring
 
     def _handle_command(self, line: str) -> None:
         word = line.strip().lower()
         if word == "quit":
             self.receiver.close()
-        elif word in _COMMANDS and self.record is not None:
-            self._command = _COMMANDS[word]
-            for session in self._sessions.values():
-                self._emit(session.command(self._command))
-            self._say(f"{word}: {_ANSWERS[self._command]}")
+        elif word in _COMMANDS and self._sessions.record is not None:
+            self._emit(self._sessions.obey(_COMMANDS[word]))
+            self._say(f"{word}: {_ANSWERS[_COMMANDS[word]]}")
         elif word in _COMMANDS:
             self._say(f"{word}: no folder to record into; start with --record FOLDER")
         elif word:

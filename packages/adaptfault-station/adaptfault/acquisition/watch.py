@@ -34,6 +34,55 @@ _RATED = 5.0  # seconds over which the rate is counted, at least so many frames:
 _FEWEST = 10
 
 
+class Waiting:
+    """Frames that wait to be monitored, ``most`` of them; the oldest are left out.
+
+    Attributes:
+        left_out: how many were.
+        ended: whether no frame is to be monitored any more.
+    """
+
+    def __init__(self, most: int) -> None:
+        self.most = most
+        self._comes = threading.Event()  # set where frames wait, or the work ends
+        self.begin()
+
+    def begin(self) -> None:
+        """Begin without a frame."""
+        self.ended = False
+        self.left_out = 0
+        self._frames: deque[tuple[NDArray[np.float64], float | None]] = deque()
+
+    def __bool__(self) -> bool:
+        return bool(self._frames)
+
+    def put(self, received: NDArray[np.float64], time: float | None) -> None:
+        """Add a frame."""
+        self._frames.append((received, time))
+        while len(self._frames) > self.most:
+            with suppress(IndexError):  # it was taken just now
+                self._frames.popleft()
+                self.left_out += 1
+        self._comes.set()
+
+    def take(self) -> tuple[NDArray[np.float64], float | None] | None:
+        """Return the frame that waits longest; None without one."""
+        with suppress(IndexError):
+            return self._frames.popleft()
+        return None
+
+    def wait(self) -> None:
+        """Wait for a frame, or the end."""
+        if not self._frames:
+            self._comes.wait()
+            self._comes.clear()
+
+    def end(self) -> None:
+        """Wake who waits, for the last time."""
+        self.ended = True
+        self._comes.set()
+
+
 class Watch:
     """Takes frames in, and states the diagnosis to publish.
 
@@ -53,8 +102,7 @@ class Watch:
         lines_held: bool | None = None,
         clock: Callable[[], float] = monotonic,
     ) -> None:
-        self.name = name
-        self.hardware_id = hardware_id
+        self.about: dict[str, Any] = {"name": name, "hardware_id": hardware_id}
         self.clock = clock
         self.sensor = sensor
         self.layout = sensor.layout
@@ -63,20 +111,16 @@ class Watch:
         self.read_out: ReadOut | None = None  # what the last scan says
         self._scans = Scans(self.layout, lines_held)
         self._changing = threading.Lock()  # held for moments, never while a frame is monitored
-        self._comes = threading.Event()  # set where frames wait, or the work ends
         self.repair = self._repair_of(sensor)
-        self._most_waiting = min(WAITING, max(1, _BYTES // (8 * self.layout.n_cells)))
-        self._silence = max(SILENCE, _PERIODS / self.layout.rate)
+        self.queue = Waiting(min(WAITING, max(1, _BYTES // (8 * self.layout.n_cells))))
         self.begin()
 
     def begin(self) -> None:
         """Wait for the first frame from now on, as after a pause in which none was asked for."""
         self.started = self.clock()
-        self._ended = False
         self.last: float | None = None  # frame of this sensor
         self.refused = ""  # why the last frame was not taken, where none was taken after it
-        self.left_out = 0  # frames that were never monitored, because too many waited
-        self._waiting: deque[tuple[NDArray[np.float64], float | None]] = deque()
+        self.queue.begin()
         self._times: deque[float] = deque(maxlen=max(_FEWEST, round(_RATED * self.layout.rate)) + 1)
 
     def switch(self, sensor: Sensor) -> None:
@@ -143,12 +187,7 @@ class Watch:
         self.refused = ""
         self.last = self.clock()
         self._times.append(self.last)
-        self._waiting.append((received, time))
-        while len(self._waiting) > self._most_waiting:
-            with suppress(IndexError):  # it was taken just now
-                self._waiting.popleft()
-                self.left_out += 1
-        self._comes.set()
+        self.queue.put(received, time)
 
     def scan(self, level: float, values: NDArray[np.float64]) -> None:
         """Take in one frame ``[D]`` of a scan of the read-out; the scan ends two seconds after its
@@ -169,28 +208,22 @@ class Watch:
         self.last = self.clock()
         version = self.sensor.version
         placed = values if version is None else values[version.source]
-        self._scans.add(Frame(self.name, self.last, placed, scan=float(level)))
+        self._scans.add(Frame(self.about["name"], self.last, placed, scan=float(level)))
 
     def _end_scan(self, now: float) -> None:
         """Take a scan that has ended for evidence: its broken cells are restored, too."""
         found = self._scans.ended(now)
         if found is not None:
             self.read_out = found
-            cells = tuple(np.flatnonzero(found.broken).tolist())
-            self.remember(FaultSet(cells, found.broken.size))
-
-    @property
-    def waiting(self) -> bool:
-        """Whether frames wait to be monitored."""
-        return bool(self._waiting)
+            self.remember(FaultSet.of(found.broken, found.broken.size))
 
     def work(self) -> tuple[Fault, ...]:
         """Monitor the frame that waits longest, if one waits; return the faults that are new,
         changed or gone."""
-        try:
-            received, time = self._waiting.popleft()
-        except IndexError:
+        frame = self.queue.take()
+        if frame is None:
             return ()
+        received, time = frame
         with self._changing:
             sensor = self.sensor
             monitor = self.monitor
@@ -213,17 +246,14 @@ class Watch:
     def work_on(self, tell: Callable[[Fault], object]) -> None:
         """Monitor frames as they come, until :meth:`end`; ``tell`` gets each fault that is new,
         changed or gone."""
-        while not self._ended:
+        while not self.queue.ended:
             for fault in self.work():
                 tell(fault)
-            if not self._waiting:
-                self._comes.wait()
-                self._comes.clear()
+            self.queue.wait()
 
     def end(self) -> None:
         """End :meth:`work_on` after the frame that is monitored now."""
-        self._ended = True
-        self._comes.set()
+        self.queue.end()
 
     def diagnostics(self, stamp: float) -> dict[str, Any]:
         """Return the content of the DiagnosticArray to publish now.
@@ -236,12 +266,13 @@ class Watch:
         """
         now = self.clock()
         self._end_scan(now)
-        about: dict[str, Any] = {"stamp": stamp, "name": self.name, "hardware_id": self.hardware_id}
+        about = {"stamp": stamp, **self.about}
+        silence = max(SILENCE, _PERIODS / self.layout.rate)
         if self.last is None:
             waited = now - self.started
-            level = Level.WARN if waited < max(GRACE, self._silence) else Level.STALE
+            level = Level.WARN if waited < max(GRACE, silence) else Level.STALE
             return stale_array(self.layout, self.refused or "no frame yet", level=level, **about)
-        if now - self.last > self._silence:
+        if now - self.last > silence:
             self._times.clear()
             message = self.refused or f"no frame for {now - self.last:.0f} s"
             return stale_array(self.layout, message, **about)
@@ -261,7 +292,7 @@ class Watch:
         return (len(times) - 1) / max(times[-1] - times[0], 1e-9)
 
     def _found(self) -> FaultSet:
-        return FaultSet(tuple(np.flatnonzero(self.faulty).tolist()), self.faulty.size)
+        return FaultSet.of(self.faulty, self.faulty.size)
 
     @staticmethod
     def _repair_of(sensor: Sensor) -> FrameRepair | None:

@@ -208,9 +208,9 @@ class TactileDiagnostics(LifecycleNode):  # type: ignore[misc]
             self.get_logger().info(
                 f"{sensor.version} of the bundle, {len(sensor.known)} known faulty cells"
             )
-        if self.watch.left_out:
+        if self.watch.queue.left_out:
             what = (
-                f"monitoring is behind: {self.watch.left_out} frames were restored and not"
+                f"monitoring is behind: {self.watch.queue.left_out} frames were restored and not"
                 " monitored"
             )
             self.get_logger().warning(what, throttle_duration_sec=10.0)

@@ -136,8 +136,7 @@ def _groups(layout: SensorLayout) -> dict[str, tuple[str, ...]]:
 def _pad(diagnosis: Diagnosis, pad: int, faults: list[Fault]) -> dict[str, Any]:
     layout = diagnosis.layout
     cells = np.flatnonzero(
-        layout.present.ravel()
-        & (np.arange(layout.n_cells) // (layout.rows * layout.shape[2]) == pad)
+        layout.is_cell & (np.arange(layout.n_cells) // (layout.rows * layout.shape[2]) == pad)
     )
     faulty = [cell for cell in diagnosis.fault_set if cell in set(cells.tolist())]
     untested = np.intersect1d(diagnosis.coverage.untested, cells).size

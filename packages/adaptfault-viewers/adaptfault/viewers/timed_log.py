@@ -69,7 +69,7 @@ class Piece:
 def on_grid(frames: NDArray[Any], layout: SensorLayout) -> NDArray[np.float32]:
     """Return frames ``[t, D]`` as float32 ``[t, pads, rows, cols]``, NaN where no cell is."""
     readings = np.array(frames, dtype=np.float32)
-    readings[:, ~layout.present.ravel()] = np.nan
+    readings[:, ~layout.is_cell] = np.nan
     return layout.grid(readings)
 
 
@@ -77,7 +77,7 @@ def states_of(diagnosis: Diagnosis) -> NDArray[np.uint8]:
     """Return the :class:`State` of each position, uint8 ``[pads, rows, cols]``."""
     layout = diagnosis.layout
     states = np.array([_OF_VERDICT[v] for v in diagnosis.verdicts], dtype=np.uint8)
-    states[~layout.present.ravel()] = State.NO_CELL
+    states[~layout.is_cell] = State.NO_CELL
     return layout.grid(states)
 
 

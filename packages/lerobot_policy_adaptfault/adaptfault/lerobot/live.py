@@ -91,7 +91,7 @@ class LiveTouch:
         fill = repair if len(frames) == 1 else repair.alone
         done = [self._watch.restored(fill, frame) for frame in frames]
         whole, restored, other = (np.array(part) for part in zip(*done, strict=True))
-        return whole, ~restored & self.layout.present.ravel(), other
+        return whole, ~restored & self.layout.is_cell, other
 
     @property
     def _repair(self) -> FrameRepair:

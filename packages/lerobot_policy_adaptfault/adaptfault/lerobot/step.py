@@ -176,7 +176,7 @@ class TouchProcessorStep(ObservationProcessorStep):  # type: ignore[misc]
                 " bundle of this sensor"
             )
         if self.live.version <= int(state["version"]):
-            self.live.remember(FaultSet(tuple(np.flatnonzero(saved).tolist()), n_cells))
+            self.live.remember(FaultSet.of(np.flatnonzero(saved), n_cells))
 
 
 def _by(shape: Sequence[int]) -> str:

@@ -29,9 +29,7 @@ from adaptfault.data.recordings.facts.labels import natural_key
 from adaptfault.data.recordings.facts.roles import (
     COUNTERS,
     EPISODES,
-    LABELS,
     in_order,
-    is_clock,
     left_out,
     reordered,
     shape_of,
@@ -45,10 +43,8 @@ from adaptfault.data.recordings.formats.datasets.axes import (
     is_time_last,
 )
 from adaptfault.data.recordings.formats.datasets.beside import (
-    Classes,
+    Beside,
     Stated,
-    given_names,
-    is_vector,
     last_part,
     plain_number,
 )
@@ -78,7 +74,6 @@ _OUTER = ("frames", "recordings")  # names of arrays [n, T, ...]
 _ENDS = ("episode_ends", "lengths", "episode_lengths")
 _INDEX = "index"
 _SHOWN = 12  # arrays in a message
-_BESIDE = ("", "data", "meta")  # groups in which arrays of the whole file stand
 _MOST_AXES = 4  # of a frame: hands, pads, rows, columns
 _LONGEST_UNIT = 16
 
@@ -97,19 +92,13 @@ class Chooser:
         self.path = path
         self.contents = contents
         self.shape = shape
-        self.stated = stated
         self.known = known
         arrays = contents.arrays
         self.ends = next((name for name in arrays if last_part(name) in _ENDS), None)
         self.outer = False
         self.is_turned = False
         self.is_doubted = False
-        aside = (*EPISODES, *LABELS, *DEVICES, *given_names(stated))
-        self._beside: dict[str, list[str]] = {}
-        for name in arrays:
-            if last_part(name) in aside or is_clock(last_part(name)):
-                self._beside.setdefault(name.rpartition("/")[0], []).append(name)
-        self._texts: dict[str, list[str]] = {}
+        self.beside = Beside(path, contents, stated)
         self.divisions: list[Division] = []
         self.by_names: list[str] = []
         self.lost: list[str] = []
@@ -153,7 +142,7 @@ class Chooser:
             self.is_doubted = is_smoothest_along_last(arrays[first[0]])
         elif not self.contents.is_table and self.known is None:
             chosen_arrays = {name: arrays[name] for name in first}
-            times = self._times(first[0])
+            times = self.beside.times(first[0])
             self.is_turned = is_time_last(self.path, chosen_arrays, self.shape, times)
         self.outer = not self.is_turned and self._holds_recordings(first)
         return found
@@ -171,9 +160,8 @@ class Chooser:
         if array.dtype.kind not in NUMBERS or name == self.ends:
             return False
         if len(array.shape) == 1:
-            aside = (*EPISODES, *COUNTERS, "index", *LABELS, *DEVICES, *given_names(self.stated))
-            return last not in aside and not is_clock(last)
-        return last not in given_names(self.stated)
+            return last not in (*COUNTERS, _INDEX) and not self.beside.tells(last)
+        return last not in self.beside.given
 
     def _refuse_left_out(self, key: str | None) -> None:
         """Raise the reason why an array that is meant was left out."""
@@ -229,7 +217,7 @@ class Chooser:
         says, or a column in its first row; None where nothing does."""
         name = part.names[0]
         stated = self.contents.declared(name).get("device")
-        column = self._near(name, DEVICES, self._length(name))
+        column = self.beside.near(name, DEVICES, self._length(name))
         if stated is None and column is not None and part.last > part.first:
             first = np.asarray(self.contents.arrays[column][part.first : part.first + 1])
             (stated,) = texts(first)
@@ -325,13 +313,13 @@ class Chooser:
         for place, (group, names) in enumerate(episodes):
             length = self._common_length(names)
             written = self._written(names, length)
-            clock = self._clock(names[0], length)
-            classes = self._classes(names[0])
+            clock = None if self.outer else self.beside.clock(names[0], length, self.lost)
+            classes = self.beside.classes(names[0])
             start = partial(Part, tuple(names), clock=clock, group=group)
             if self.outer:
                 for i, frames in enumerate(self._lengths(names[0])):
                     label = classes.of_recording(i, length)
-                    yield start(0, frames if i < written else 0, outer=i, clock=None, label=label)
+                    yield start(0, frames if i < written else 0, outer=i, label=label)
                 continue
             column = self._episode_column(names[0], length)
             if self.ends is not None:
@@ -387,8 +375,8 @@ class Chooser:
         Raises:
             InputError: there is one of another shape.
         """
-        column = self._near(name, EPISODES, length)
-        other = self._near(name, EPISODES)
+        column = self.beside.near(name, EPISODES, length)
+        other = self.beside.near(name, EPISODES)
         if column is None and other is not None and self.contents.is_table:
             what = f"{other} holds lists; expected one number a row, that of its episode"
             raise InputError.at(self.path, what)
@@ -442,78 +430,3 @@ class Chooser:
         changes = np.flatnonzero(stored[1:] != stored[:-1]) + 1
         ends = [0, *changes.tolist(), len(stored)] if len(stored) else []
         return [Episode(first, last, plain_number(stored[first])) for first, last in pairwise(ends)]
-
-    def _near(self, name: str, wanted: Sequence[str], length: int | None = None) -> str | None:
-        """Return an array in the group of ``name``, or above it: the first of the names that are
-        wanted.
-
-        Args:
-            name: of an array of readings.
-            wanted: the last part of names.
-            length: how many values it holds; None: any number.
-        """
-        arrays = self.contents.arrays
-        for group in self._groups(name):
-            named = {last_part(one): one for one in reversed(self._beside.get(group, []))}
-            for one in wanted:
-                found = named.get(one)
-                if found and (length is None or is_vector(arrays[found], length)):
-                    return found
-        return None
-
-    def _groups(self, name: str) -> list[str]:
-        """Return the group of an array, those above it, and those of the whole file."""
-        groups = name.split("/")[:-1]
-        above = ["/".join(groups[:depth]) for depth in range(len(groups), 0, -1)]
-        return list(dict.fromkeys([*above, *_BESIDE]))
-
-    def _times(self, name: str) -> list[int]:
-        """Return how many values the arrays of times near an array hold, each one a vector."""
-        near = [one for group in self._groups(name) for one in self._beside.get(group, [])]
-        found = [self.contents.arrays[one].shape for one in near if is_clock(last_part(one))]
-        return [max(sizes) for sizes in found if sizes and math.prod(sizes) == max(sizes) > 1]
-
-    def _clock(self, name: str, length: int) -> str | None:
-        stated = self.stated.clock
-        arrays = self.contents.arrays
-        near = [one for group in self._groups(name) for one in self._beside.get(group, [])]
-        wrong = []
-        for other in near if stated is None else [*near, stated]:
-            if stated is None:
-                is_meant = is_clock(last_part(other))
-            else:
-                is_meant = f"/{other.lower()}".endswith(f"/{stated.lower()}")
-            if is_meant and other in arrays:
-                if is_vector(arrays[other], length):
-                    return other
-                sizes = arrays[other].shape
-                if len(sizes) == 1 and sizes[0] > 1 and not self.outer:
-                    what = f"{other} holds {sizes[0]} values where {name} has {length} frames"
-                    wrong.append(f"{what}: passed over")
-        self.lost += wrong
-        if stated is None or self.outer:
-            return None
-        raise self._absent("time-column", stated, " of one number a frame")
-
-    def _absent(self, option: str, name: str, what: str) -> InputError:
-        held = ", ".join(sorted(self.contents.arrays, key=natural_key)[:_SHOWN])
-        told = f"--{option} {name}: holds no such array{what}; it holds {held}"
-        return InputError.at(self.path, told)
-
-    def _classes(self, name: str) -> Classes:
-        """Return the classes of recordings, or of frames, beside an array of readings."""
-        stated = self.stated.label
-        wanted = LABELS if stated is None else (last_part(stated),)
-        value = self.contents.attribute(name, wanted)
-        if value is not None:
-            return Classes(self.path, stated, common=str(value))
-        holder = self._near(name, wanted)
-        if stated is not None and (holder is None or stated in self.contents.arrays):
-            holder = stated
-        if holder is None:
-            return Classes(self.path, stated)
-        if holder not in self.contents.arrays:
-            raise self._absent("label-column", str(stated), " or attribute")
-        if holder not in self._texts:
-            self._texts[holder] = texts(self.contents.arrays[holder][:])
-        return Classes(self.path, stated, holder, self._texts[holder])

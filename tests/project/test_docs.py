@@ -217,16 +217,6 @@ def test_the_page_of_formats_names_every_key_and_field_that_is_read(tmp_path):
     assert str(read_layout(tmp_path / "layout.json")) == "1 x 6 x 9 cells, 0..3.3 V, 100 Hz"
 
 
-def test_tests_that_the_page_of_security_names_exist():
-    named = re.findall(
-        r"`(?:tests/\w+/)?(test_\w+\.py)(?:::(\w+))?`", (HOME / "docs" / "security.md").read_text()
-    )
-    assert len(named) > 20
-    for file, name in named:
-        (path,) = (HOME / "tests").rglob(file)
-        assert f"\ndef {name}(" in path.read_text() if name else True
-
-
 @pytest.mark.parametrize(
     "page", [*PAGES, HOME / "CONTRIBUTING.md", HOME / "CHANGELOG.md"], ids=lambda page: page.name
 )

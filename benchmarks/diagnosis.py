@@ -9,7 +9,7 @@ code is then 1. ``--out FILE`` keeps the counts (JSON lines); a run that was cut
 it stopped. Real arrays are read from ``../shared/data`` and left out where that is absent.
 
 ``--method my_package:MyDetector`` runs somebody's own detector on the same logs, and prints its
-figures beside ours: those that need no more than F. See ``docs/your-method.md``.
+figures beside ours: those that need no more than F. See ``docs/bench.md``.
 
 The method is chosen on splits 0 and 1. Splits 2 and 3 are for the end: ``--splits 2 3``.
 """

@@ -28,8 +28,8 @@ TINY = Array("tiny", ("cells", "healthy", "lines", "cold"), simulated(grasps(LAY
 @pytest.fixture
 def example(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
     """The detector of the page, in a module of the working directory."""
-    page = (HOME / "docs" / "your-method.md").read_text()
-    (code,) = re.findall(r"^```python\n(.*?)^```$", page, re.DOTALL | re.MULTILINE)
+    page = (HOME / "docs" / "bench.md").read_text()
+    code, _ = re.findall(r"^```python\n(.*?)^```$", page, re.DOTALL | re.MULTILINE)
     (tmp_path / "method_of_the_page.py").write_text(code)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", sys.path[:])

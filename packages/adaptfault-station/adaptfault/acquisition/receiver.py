@@ -31,7 +31,7 @@ _TURNS = 8  # of the event loop for each frame fetched; each turn reads one data
 _BOUND = 10.0  # seconds of silence after which a device may send from another address
 _IDLE = 2.0  # seconds of silence after which a device may give its place to another one
 _TICK = 0.05  # seconds between checks for held packets
-_TELL = 10.0  # seconds between two lines about packets that are no packets of this array
+_TELL = 10.0  # seconds between two lines about packets that are not taken
 
 _OUTSIDE = ("devices", "lost", "restarts")  # counts of something else than datagrams
 
@@ -115,8 +115,9 @@ class Receiver(asyncio.DatagramProtocol):
         on_frame: called with each frame before it waits to be fetched, also where the queue
             discards it.
         on_trouble: called with a device ("": none) and one line about packets that are malformed,
-            oversized or not authentic (the first one, then a count every 10 s), and about a clock
-            that runs in another unit than ``ticks`` states (once a device).
+            oversized, not authentic or from a device beyond the limit (the first one, then a count
+            every 10 s), and about a clock that runs in another unit than ``ticks`` states (once a
+            device).
 
     Raises:
         ValueError: an address in ``devices`` is none.
@@ -159,7 +160,7 @@ class Receiver(asyncio.DatagramProtocol):
         self._received = self._dropped = self._malformed = self._oversized = self._forged = (
             self._refused
         ) = 0
-        self._told: float | None = None  # when a packet was told that is none of this array
+        self._told: float | None = None  # when a packet was told that is not taken
         self._untold = 0  # such packets since then
         self._last_problem = ""
         self._transport: asyncio.BaseTransport | None = None
@@ -225,6 +226,8 @@ class Receiver(asyncio.DatagramProtocol):
         if stream is None:
             if len(self._streams) >= self.most_devices and not self._evict(now):
                 self._refused += 1
+                most = f"{self.most_devices} devices send, and no more are taken"
+                self._tell(f"{most}; --device NAME takes the named ones alone", now, sender)
                 return
             stream = self._streams[packet.device] = Ordering(
                 packet.device, self.layout.rate, window=self.window, restarts=self.key is None
@@ -241,7 +244,7 @@ class Receiver(asyncio.DatagramProtocol):
         self._put(stream.push(packet, now))
 
     def _tell(self, problem: str, now: float, sender: str) -> None:
-        """Tell the first datagram that is no packet of this array; later ones are told together."""
+        """Tell the first datagram that is not taken; later ones are told together."""
         if self.on_trouble is None:
             return
         self._last_problem = f"{problem}{f' (from {sender})' if sender else ''}"

@@ -565,6 +565,16 @@ class SelfDiagnosis:
         aliases = find_aliasing(stream, partial(stream.cold.log_likelihood, stream))
         return judged_cold(stream, aliases, rate, full_scale)
 
+    def _judged(self, log: RecordingBlocks, crosstalk: Crosstalk | None) -> Diagnosis:
+        """Return the diagnosis of a log, without a gain of the whole array where fewer cells are
+        faulty then."""
+        found = self._diagnosed(log, crosstalk=crosstalk)
+        usual = self.without_gain(log.given) if found.faults and crosstalk is None else None
+        if usual is None:
+            return found
+        without = self._diagnosed(usual)
+        return without if len(without.fault_set) < len(found.fault_set) else found
+
     def without_gain(self, recordings: ArrayLike | Sequence[ArrayLike]) -> RecordingBlocks | None:
         """Return a log without the gain that the whole array has in it; None where it has none, or
         none is known (:mod:`diagnostics.sensor.gain`).
@@ -619,12 +629,12 @@ class SelfDiagnosis:
 
         def of_part(some: tuple[int, ...]) -> Diagnosis:
             part = RecordingBlocks([log.given[i] for i in some])
-            found = self._diagnosed(part, crosstalk=crosstalk)
+            found = self._judged(part, crosstalk)
             # a part of a log does not tell that all of it is disturbed
             moves = knows(some) and not whole.contradicting
             return found if moves else of_any_movement(found, held.suspect[list(some)])
 
-        whole = self._diagnosed(log, crosstalk=crosstalk)
+        whole = self._judged(log, crosstalk)
         if not knows(tuple(range(len(log)))):
             whole = of_any_movement(whole, held.suspect)
         lengths = [len(given) for given in log.given]

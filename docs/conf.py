@@ -14,6 +14,7 @@ from sphinx.addnodes import pending_xref
 from sphinx.application import Sphinx
 from sphinx.domains.python import PyObject
 from sphinx.environment import BuildEnvironment
+from sphinx.ext.autodoc.mock import mock, undecorate
 from sphinx.util import logging
 
 PUBLIC = ("adaptfault", "diagnostics")
@@ -178,11 +179,19 @@ def several_names(
             lines[i] = f":ivar {names[1].replace(', ', ',')}:{line[names.end() :]}"
 
 
+def undecorated(app: Sphinx) -> None:
+    """Describe what a mocked registry decorates as it is written: the decorator returns a mock."""
+    with mock(app.config.autodoc_mock_imports):
+        step = importlib.import_module("adaptfault.lerobot.step")
+    step.TouchProcessorStep = undecorate(step.TouchProcessorStep)
+
+
 def setup(app: Sphinx) -> None:
     """Connect the functions above."""
     for field in PyObject.doc_field_types:
         if field.name == "variable":
             field.label = "Attributes"
+    app.connect("builder-inited", undecorated)
     app.connect("source-read", follow_elsewhere)
     app.connect("env-check-consistency", missing_names)
     app.connect("missing-reference", public_name)

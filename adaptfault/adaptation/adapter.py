@@ -33,7 +33,7 @@ class Adapter(FaultFreeModel):
         train, validation: fault-free windows; more than 2500 validation windows are thinned evenly.
         A regression has
             targets y float ``[N, k]``, a policy actions of the shape that it returns. What else a
-            policy sees is their :attr:`~adaptfault.Windows.extra`, which no repair changes; their
+            policy sees is their ``extra``, which no repair changes; their
             recordings are its episodes, of which none is in both.
         layout: the array; None: ``model.layout``.
         features: feature vector for a new head: the name of a layer (its output), or a function of

@@ -148,6 +148,7 @@ class Forecast:
     def __str__(self) -> str:
         k = len(self.fault_set)
         many = "many new recordings" if np.isinf(self.n_new) else f"{self.n_new:g} new ones"
+        many += " like these"
         lines = [
             f"expected {self.measure} without {k} cells, from {self.n_recordings} recordings (95 %"
             f" interval, {many}):"

@@ -87,8 +87,9 @@ def test_thirty_invented_names_a_second_load_nothing_and_take_no_frame_of_a_real
     assert watched == {"real", "second"}
     assert len(loaded) == 1
     told = [event.text for event in events if event.kind == "trouble"]
-    assert 1 <= len(told) <= 2
-    assert "went unwatched; --device NAME" in told[0]
+    for said in ("went unwatched; --device NAME", "16 devices send, and no more are taken"):
+        assert 1 <= sum(said in text for text in told) <= 2
+    assert len(told) <= 4
 
 
 def test_a_second_device_is_watched_by_itself_and_shares_the_model(station):

@@ -328,6 +328,20 @@ def test_packets_that_are_dropped_are_told_when_they_come_and_then_counted_every
     assert receiver.counters.malformed == 250
 
 
+def test_devices_beyond_the_limit_are_told_with_what_to_do():
+    heard = []
+    receiver = Receiver(SMALL, most_devices=2, on_trouble=lambda device, text: heard.append(text))
+    for i in range(150):
+        for name in ("a", "b", "c", "d"):
+            receiver.take(format_packet(name, i / 10, np.ones(6)), i / 10, "10.0.0.7")
+    told = "2 devices send, and no more are taken; --device NAME takes the named ones alone"
+    assert heard == [
+        f"a packet is dropped: {told} (from 10.0.0.7)",
+        f"200 more packets are dropped, the last: {told} (from 10.0.0.7)",
+    ]
+    assert receiver.counters.refused == 300
+
+
 def test_the_counts_of_the_last_line_add_up_where_frames_were_dropped():
     receiver, _ = taken([*packets(300), b"garbage", b"a" * 60000, *packets(1)], queue=100)
     text = str(receiver.counters)

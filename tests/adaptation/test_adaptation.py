@@ -358,7 +358,7 @@ def test_an_interval_for_more_recordings_is_narrower(adapter):
         widths.append(expected.high - expected.low)
     assert widths == sorted(widths, reverse=True)
     assert len(set(widths)) == 4
-    assert "many new recordings" in str(forecast)
+    assert "many new recordings like these" in str(forecast)
     assert json.loads(json.dumps(forecast.to_dict(), allow_nan=False))["n_new"] is None
     with pytest.raises(ValueError, match="a positive number of new recordings, got 0"):
         adapter.forecast(F, recordings=0)

@@ -362,7 +362,8 @@ def test_flat_features_that_are_taken_as_rows_are_told(tmp_path):
     path = table(tmp_path / "a.parquet", tactile_l=lists(X[:, :6]), tactile_r=lists(X[:, 6:]))
     loaded = load(path)
     assert loaded.recordings.layout.shape == (2, 1, 6)
-    assert "each is taken as one row; --shape states them" in messages(loaded, "warning")[0]
+    (said,) = messages(loaded, "warning")
+    assert "each is taken as one row, and a broken row or column shows as single cells" in said
     assert not load(path, layout="2x2x3").problems
 
 

@@ -468,6 +468,25 @@ def test_columns_of_text_are_named_with_the_option_that_leaves_them_out(tmp_path
     is_read(file, ignore="note")
 
 
+def test_each_column_of_many_is_looked_up_once():
+    from adaptfault.data.recordings.formats.columns import _numbered
+
+    class Counted(int):
+        compared = 0
+        __hash__ = int.__hash__
+
+        def __eq__(self, other):
+            Counted.compared += 1
+            return int(self) == other
+
+    names = ["note", *(f"c{i}" for i in range(900))]
+    columns = [Counted(i) for i in range(len(names))]
+    kept, told = _numbered(names, columns, None)
+    assert kept == list(range(1, len(names)))
+    assert "note left out" in told[0]
+    assert Counted.compared < 10 * len(names)
+
+
 def test_what_is_not_numbered_beside_numbered_readings_is_left_out_and_told(table):
     loaded = load(table, layout="2x3")
     np.testing.assert_array_equal(loaded.recordings.frames[0], VALUES.astype(np.float32))

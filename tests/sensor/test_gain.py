@@ -55,6 +55,19 @@ def test_an_array_with_another_gain_is_told_and_diagnosis_and_inspection_blame_n
     assert not fitted.diagnose(log).fault_set
 
 
+def test_grasps_that_begin_in_contact_with_another_gain_blame_nobody():
+    layout = SensorLayout(2, 6, 5)
+    healthy = list(af.simulate(12, layout, n_frames=60, seed=7, sensor_seed=7).frames)
+    fitted = SelfDiagnosis(layout).fit(healthy)
+    log = [2 * r for r in af.simulate(4, layout, n_frames=60, seed=57, sensor_seed=7).frames]
+    dead = [inject(r, [Fault("open", (7,)), Fault("short", (40,))], layout) for r in log]
+    found = af.inspect(log, fitted, reference=healthy)
+    assert "gain" in {finding.name for finding in found.findings}
+    assert not found.diagnosis.fault_set
+    assert not fitted.diagnose(log).fault_set
+    assert set(fitted.diagnose(dead).fault_set) == {7, 40}
+
+
 @settings(max_examples=20)
 @given(gain=st.floats(0.3, 3), seed=st.integers(0, 99))
 def test_a_gain_is_measured_where_a_few_counts_are_a_load(gain, seed):

@@ -252,7 +252,7 @@ def _numbered(
         return columns, ()
     cells = None if shape is None else math.prod(shape)
     kept = [columns[i] for i in readings_of([names[i] for i in columns], cells)]
-    others = [names[i] or str(i) for i in columns if i not in kept]
+    others = [names[i] or str(i) for i in sorted(set(columns) - set(kept))]
     told = [left_out(others, [names[i] for i in kept], "columns")]
     ordered = [kept[i] for i in in_order([names[i] for i in kept], shape)]
     told.append(reordered([names[i] for i in kept], [names[i] for i in ordered], "columns"))

@@ -32,7 +32,7 @@ _TURNS = 8  # of the event loop for each frame fetched; each turn reads one data
 _BOUND = 10.0  # seconds of silence after which a device may send from another address
 _IDLE = 2.0  # seconds of silence after which a device may give its place to another one
 _TICK = 0.05  # seconds between checks for held packets
-_TELL = 10.0  # seconds between two lines about packets that are no packets of this array
+_TELL = 10.0  # seconds between two lines about packets that are not taken
 
 _OUTSIDE = ("devices", "lost", "restarts")  # counts of something else than datagrams
 
@@ -98,7 +98,7 @@ _REFUSED: dict[type[PacketError], str] = {_Oversized: "oversized", NotAuthentic:
 
 
 class _Dropping:
-    """Tells the first datagram that is no packet of this array; later ones are told together."""
+    """Tells the first datagram that is not taken; later ones are told together."""
 
     def __init__(self, on_trouble: Callable[[str, str], None] | None) -> None:
         self._on_trouble = on_trouble
@@ -220,6 +220,8 @@ class Intake:
         if device is not None:
             return device if sender == device.address or now - device.last >= _BOUND else None
         if len(self._devices) >= self.most_devices and not self._evict(now):
+            most = f"{self.most_devices} devices send, and no more are taken"
+            self._dropping.tell(f"{most}; --device NAME takes the named ones alone", now, sender)
             return None
         rate = self.layout.rate
         stream = Ordering(name, rate, window=self.window, restarts=self.key is None)
@@ -288,8 +290,9 @@ class Receiver(Intake, asyncio.DatagramProtocol):
         on_frame: called with each frame before it waits to be fetched, also where the queue
             discards it.
         on_trouble: called with a device ("": none) and one line about packets that are malformed,
-            oversized or not authentic (the first one, then a count every 10 s), and about a clock
-            that runs in another unit than ``ticks`` states (once a device).
+            oversized, not authentic or from a device beyond the limit (the first one, then a count
+            every 10 s), and about a clock that runs in another unit than ``ticks`` states (once a
+            device).
 
     Raises:
         ValueError: an address in ``devices`` is none.

@@ -40,7 +40,10 @@ _EPISODE = re.compile(
 _SEPARATOR = re.compile(r"[/.]")
 _SHOWN = 12  # features in a message
 
-GUESSED = "nothing states rows and columns, so each is taken as one row; --shape states them"
+GUESSED = (
+    "nothing states rows and columns, so each is taken as one row, and a broken row or column shows"
+    " as single cells; --shape states them"
+)
 """What is said of flat features."""
 
 Sizes = tuple[int, ...]

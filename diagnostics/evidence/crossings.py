@@ -20,8 +20,9 @@ The part of a line beyond a cut leaks nothing, and joins the lines that cross it
 not conduct for certain may lie on one, and one of them may be shorted. Where a crossing is shorted,
 it brings current also to lines that are held.
 
-Not covered: leakages of lines that differ by more than a factor of ten; some open crossings may
-then pass for held ones that conduct little.
+Not covered: leakages of lines that differ by more than a factor of ten, and a read-out that holds
+rows and lets columns float, or the other way, beside a shorted crossing or a cut line. Open
+crossings may then pass for held ones; a scan of such a read-out states ``holds_lines=False``.
 """
 
 from __future__ import annotations

@@ -94,9 +94,12 @@ def with_recordings(
         if diagnose is None or told.cells[state.cells].all():
             continue
         part = diagnose(state.recordings)
-        for fault in part.faults:
-            at = told.cells[list(fault.cells)]
-            if not at.all() and (fault.line is not None or not at.any()):
+        new = [fault for fault in part.faults if _is_new(fault, told)]
+        # of so many sets of recordings one or the other shows something by chance
+        if max((fault.probability or 0.0 for fault in new), default=0.0) < _sure(len(lengths)):
+            continue
+        for fault in new:
+            if _is_new(fault, told):
                 shown = _shown_in(state.recordings, fault, first)
                 told.add(shown, part.probability[list(fault.cells)])
     for fault in partly:
@@ -107,6 +110,18 @@ def with_recordings(
         assert fault.recordings is not None
         told.add(_shown_in(fault.recordings, fault, first), fault.probability or 0.0)
     return _with_states(whole, held, told, tolerance, first)
+
+
+def _is_new(fault: Fault, told: _Faults) -> bool:
+    """Return whether no cell of a fault was told, or not all of a wire."""
+    at = told.cells[list(fault.cells)]
+    return not at.all() and (fault.line is not None or not at.any())
+
+
+def _sure(recordings: int) -> float:
+    """Return the P(faulty) that remains 1/2 among all sets of successive recordings."""
+    sets = recordings * (recordings + 1) / 2
+    return sets / (sets + 1)
 
 
 def _with_states(

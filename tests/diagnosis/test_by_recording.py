@@ -75,6 +75,29 @@ def test_whatever_is_suspect_is_faulty_or_told_as_possible_and_untested(cells, w
     assert all("perhaps" in fault.reason for fault in told.possible)
 
 
+@given(n=st.integers(4, 60), odds=st.floats(0.5, 2))
+def test_what_a_set_of_recordings_shows_is_told_where_no_other_set_may_by_chance(n, odds):
+    where = tuple(range(n - n // 3, n))
+    suspect = np.zeros((n, 64), bool)
+    suspect[np.ix_(where, [STUCK])] = True
+    of_cells = np.where(suspect.any(axis=0), 9.0, -np.inf)
+    nothing = np.full(64, np.nan)
+    held = Held(of_cells, suspect, ~suspect, nothing, np.zeros_like(suspect), nothing)
+    whole = Diagnosis(LAYOUT, (), np.zeros(64), np.ones(64, bool), 10 * n, n_recordings=n)
+    against = odds * n * (n + 1) / 2
+    likely = against / (1 + against)
+    probability = np.where(np.arange(64) == STUCK, likely, 0.0)
+
+    def diagnose(recordings):
+        assert recordings == where
+        fault = Fault(FaultKind.STUCK, (STUCK,), probability=likely)
+        return Diagnosis(LAYOUT, (fault,), probability, np.ones(64, bool), 10, len(where))
+
+    told = with_recordings(whole, held, [10] * n, 0.01, diagnose)
+    assert (told.fault_set == {STUCK}) == (odds >= 1)
+    assert [fault.cells for fault in told.possible] == ([] if odds >= 1 else [(STUCK,)])
+
+
 def test_each_recording_has_verdicts_of_its_own(diagnosis, grasps):
     told = diagnosis.by_recording
     assert told.verdicts.shape == told.probability.shape == (len(grasps), 64)

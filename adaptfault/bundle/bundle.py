@@ -161,11 +161,7 @@ class Bundle(Running):
                 kind, the diagnoser is not fitted, or ``head`` is unknown.
         """
         path = Path(path)
-        if path.exists():
-            raise FileExistsError(f"{path} exists: choose another name, or remove it")
-        check_parts(model, adapter, diagnoser, class_names, check)
-        if head not in ("auto", "linear"):
-            raise ValueError(f"unknown head {head!r}: use 'auto' or 'linear'")
+        check_parts(path, model, adapter, diagnoser, class_names, check, head)
         make_folder(path.parent)
         new = path.with_name(f".{path.name}.unfinished")
         shutil.rmtree(new, ignore_errors=True)  # left by a crash

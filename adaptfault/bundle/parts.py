@@ -220,14 +220,18 @@ def split_validation(adapter: Adapter) -> tuple[Adapter, Windows]:
 
 
 def check_parts(
+    path: Path,
     model: TactileTransformer | AnyModel,
     adapter: Adapter,
     diagnoser: SelfDiagnosis,
     class_names: Sequence[str],
     check: Windows | None,
+    head: str,
 ) -> None:
     """Refuse parts that make no bundle, before anything is written; the errors are those of
     :meth:`~adaptfault.bundle.bundle.Bundle.create`."""
+    if path.exists():
+        raise FileExistsError(f"{path} exists: choose another name, or remove it")
     if not diagnoser.layout.shape == adapter.model.layout.shape == model.layout.shape:
         raise ValueError(
             f"model, adapter and diagnoser need one array shape; got {model.layout} and"
@@ -244,6 +248,8 @@ def check_parts(
             f"check has targets [N{_more(check)}], the adapter [N{_more(adapter.validation)}]:"
             " give windows with the same classes or values"
         )
+    if head not in ("auto", "linear"):
+        raise ValueError(f"unknown head {head!r}: use 'auto' or 'linear'")
 
 
 def _more(windows: Windows) -> str:

@@ -201,7 +201,8 @@ class _FaultTolerant(MetaEstimatorMixin, BaseEstimator):  # type: ignore[misc]
     def predict(self, X: ArrayLike) -> NDArray[Any]:
         """Return predictions ``[n]`` for samples ``[n, D]``; the columns of F may hold anything,
         NaN included."""
-        return np.asarray(self.estimator_.predict(self._input(X)))
+        x = self._input(X)
+        return np.asarray(self.estimator_.predict(x))
 
     def _input(self, X: ArrayLike) -> NDArray[np.float64]:
         check_is_fitted(self)
@@ -267,12 +268,14 @@ class FaultTolerantClassifier(ClassifierMixin, _FaultTolerant):  # type: ignore[
     @available_if(_estimator_has("predict_proba"))  # type: ignore[untyped-decorator, unused-ignore]
     def predict_proba(self, X: ArrayLike) -> NDArray[np.float64]:
         """Return class probabilities ``[n, n_classes]``."""
-        return np.asarray(self.estimator_.predict_proba(self._input(X)))
+        x = self._input(X)
+        return np.asarray(self.estimator_.predict_proba(x))
 
     @available_if(_estimator_has("decision_function"))  # type: ignore[untyped-decorator, unused-ignore]
     def decision_function(self, X: ArrayLike) -> NDArray[np.float64]:
         """Return the decision function ``[n]`` or ``[n, n_classes]``."""
-        return np.asarray(self.estimator_.decision_function(self._input(X)))
+        x = self._input(X)
+        return np.asarray(self.estimator_.decision_function(x))
 
 
 class FaultTolerantRegressor(RegressorMixin, _FaultTolerant):  # type: ignore[misc]

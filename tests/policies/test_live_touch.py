@@ -65,7 +65,7 @@ def test_a_version_that_is_deployed_takes_over_between_two_frames(bundle, live, 
     assert (set(live.fault_set), live.version) == (set(DEAD), 2)
     deploy(bundle, (*DEAD, 40))
     whole(live, frame)
-    live._follower._loading.join()
+    live._follower.reload.thread.join()
     _, valid, _ = whole(live, frame)
     assert np.flatnonzero(~valid[0]).tolist() == [*DEAD, 40]
     assert live.version == 3

@@ -50,11 +50,12 @@ def of_kinds(recordings: af.Recordings, kinds: dict[str, str]) -> tuple[af.Windo
 
 
 def kept_out(objects: np.ndarray, kinds: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Return a quarter of the objects of each kind."""
+    """Return a quarter of the objects of each kind that has several."""
     chosen = []
     for kind in np.unique(kinds):
         of_kind = rng.permutation(np.unique(objects[kinds == kind]))
-        chosen.append(of_kind[: max(1, len(of_kind) // 4)])
+        if len(of_kind) > 1:
+            chosen.append(of_kind[: max(1, len(of_kind) // 4)])
     return np.concatenate(chosen)
 
 
@@ -101,6 +102,8 @@ def main() -> None:
     parser.add_argument("--windows", type=int, default=1000, help="of training, for a head")
     parser.add_argument("--small", action="store_true", help="to see that everything runs")
     args = parser.parse_args()
+    if args.recordings is not None and args.kinds is None:
+        parser.error("recordings need --kinds: a CSV table class,kind")
     grasps = 40
     if args.small:
         args.draws = args.sets = args.epochs = 1

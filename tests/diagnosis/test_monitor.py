@@ -514,7 +514,7 @@ def test_with_a_scan_it_gives_the_diagnosis_of_all_frames_and_the_scan(fitted, l
 
 
 def test_what_a_scan_finds_is_told_at_once_and_once(fitted, log):
-    monitor = Monitor(fitted)
+    monitor = Monitor(fitted, wait=True)
     scan = scan_of(*BROKEN)
     expected = {7, *LAYOUT.cells_on(ROW).tolist()}
     assert cells_of(monitor.scan(scan)) == expected
@@ -527,7 +527,7 @@ def test_what_a_scan_finds_is_told_at_once_and_once(fitted, log):
 
 
 def test_what_the_next_scan_does_not_find_is_told_as_gone(fitted, log):
-    monitor = Monitor(fitted)
+    monitor = Monitor(fitted, wait=True)
     monitor.scan(scan_of(*BROKEN))
     told(monitor, log[:200])
     assert monitor.scan(scan_of(BROKEN[0])) == ()
@@ -538,7 +538,7 @@ def test_what_the_next_scan_does_not_find_is_told_as_gone(fitted, log):
 
 
 def test_a_scan_that_was_interrupted_leaves_the_one_before(fitted, log):
-    monitor = Monitor(fitted)
+    monitor = Monitor(fitted, wait=True)
     whole = scan_of(*BROKEN)
     monitor.scan(whole)
     told(monitor, log[:40])
@@ -548,7 +548,7 @@ def test_a_scan_that_was_interrupted_leaves_the_one_before(fitted, log):
 
 
 def test_a_scan_of_another_array_is_refused_in_one_line_and_changes_nothing(fitted, log):
-    monitor = Monitor(fitted)
+    monitor = Monitor(fitted, wait=True)
     told(monitor, log[:40])
     before = monitor.diagnosis().to_dict()
     with pytest.raises(ValueError, match=r"a scan of 4 cells, but the array has 220") as caught:
@@ -558,7 +558,7 @@ def test_a_scan_of_another_array_is_refused_in_one_line_and_changes_nothing(fitt
 
 
 def test_a_copy_of_a_monitor_holds_the_scan(fitted, log):
-    monitor = Monitor(fitted)
+    monitor = Monitor(fitted, wait=True)
     monitor.scan(scan_of(*BROKEN))
     told(monitor, log[:40])
     twin = pickle.loads(pickle.dumps(monitor))

@@ -184,7 +184,7 @@ class SelfDiagnosis:
         log = checked_recordings(recordings, self.layout)
         with one_thread():
             given = measured(log, self.layout)
-            self.copies_ = find_copies(given, self.layout.present.ravel())
+            self.copies_ = find_copies(given, self.layout.is_cell)
             independent = np.unique(self.copies_)
             chosen = RecordingBlocks([given[i] for i in independent])
             self._fit(chosen, progress, strict=strict)
@@ -206,7 +206,7 @@ class SelfDiagnosis:
         """Fit; ``suspected``: P(dead) ``[D]`` of cells that are dead if they never move; None:
         found here."""
         progress(0.0)
-        present = self.layout.present.ravel()
+        present = self.layout.is_cell
         healthy = recordings.valid(self.layout.full_scale, present).whole(present)
         layout = self._planes
         if self.layout.axes > 1:
@@ -232,7 +232,7 @@ class SelfDiagnosis:
             dead = np.where(never_moved(healthy, tolerance), suspected[self._order], 0.0)
         self.reference_ = Reference.fit(healthy, layout, dead)
         near = self.reference_.scale.near
-        usual = UsualSizes.of(list(healthy), near, living(layout, dead).present.ravel())
+        usual = UsualSizes.of(list(healthy), near, living(layout, dead).is_cell)
         floors = lowest_floors(healthy, self.reference_.scale.baseline, living(layout, dead))
         model = fit_model(list(healthy), layout, dead > 0, progress=progress)
         self.reference_ = replace(self.reference_, sizes=usual, floors=floors, model=model)
@@ -332,7 +332,7 @@ class SelfDiagnosis:
 
     def _loads(self, log: RecordingBlocks) -> RecordingBlocks | None:
         """Return the loads of a log; None where a cell rests in the middle, or has several axes."""
-        valid = log.valid(self.layout.full_scale, self.layout.present.ravel())
+        valid = log.valid(self.layout.full_scale, self.layout.is_cell)
         if self.layout.axes > 1:
             return None
         if self.load_ is None:
@@ -591,7 +591,7 @@ class SelfDiagnosis:
         if loads is None or reference is None or reference.sizes is None:
             return None
         scale = reference.scale
-        present = living(self._planes, reference.dead).present.ravel()
+        present = living(self._planes, reference.dead).is_cell
         gain = reference.sizes.gain(list(loads), scale.near, present)
         if gain == 1.0:
             return None
@@ -663,7 +663,7 @@ class SelfDiagnosis:
 
     def _in_planes(self, log: RecordingBlocks) -> list[NDArray[np.float64]]:
         """Return the loads of a log, each axis of a pad as a pad of its own."""
-        valid = log.valid(self.layout.full_scale, self.layout.present.ravel())
+        valid = log.valid(self.layout.full_scale, self.layout.is_cell)
         given = [np.asarray(frames, dtype=np.float64)[:, self._order] for frames in valid.given]
         if self.load_ is None:
             return given

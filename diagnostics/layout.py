@@ -246,7 +246,7 @@ class SensorLayout(Positions):
 
     @cached_property
     def _served(self) -> dict[Line, NDArray[np.intp]]:
-        present = self.present.ravel()
+        present = self.is_cell
         served = {}
         for line in self.lines:
             pad = self._grid[line.pad]
@@ -279,7 +279,7 @@ class SensorLayout(Positions):
         sources = np.where(
             (selected < len(wires))[:, None], pad[np.minimum(selected, len(wires) - 1)], -1
         )
-        present = self.present.ravel()
+        present = self.is_cell
         cells = pad[moved].ravel()
         sources = sources[moved].ravel()
         sources = np.where((sources >= 0) & present[np.maximum(sources, 0)], sources, -1)

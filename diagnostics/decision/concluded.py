@@ -62,7 +62,7 @@ def concluded(
     scale = stream.scale
     working = np.empty_like(inferred)
     moved = bool((stream.runs.moved & stream.present).any())
-    working[place] = ~inferred & (found.alive if moved else layout.present.ravel())
+    working[place] = ~inferred & (found.alive if moved else layout.is_cell)
     # Where cells moved, loads of a frozen frame come or go: other cells have another offset.
     rest = np.maximum(scale.baseline, stream.lowest) if moved else scale.baseline
     return Diagnosis(

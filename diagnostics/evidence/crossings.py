@@ -205,7 +205,7 @@ def through_others(
     every = np.full_like(response, usual)
     every[tells] = known
     every[short] = _SHORTED * float(known.max())
-    every[~layout.present.ravel()] = 0.0
+    every[~layout.is_cell] = 0.0
     given = layout.grid(every)
     error = layout.grid(np.where(tells, least, np.inf))
     found = np.zeros_like(given)

@@ -206,7 +206,7 @@ class ReadOut:
     @property
     def summary(self) -> str:
         """How many cells the scan tested, and what is wrong with it, in one line."""
-        present = self.layout.present.ravel()
+        present = self.layout.is_cell
         tested = int((self.alive | self.broken)[present].sum())
         said = [f"{tested} of {int(present.sum())} cells tested"]
         if self.under_load:
@@ -343,7 +343,7 @@ def _judged(
         held: whether lines that are not selected are held; None: not stated.
     """
     measured = np.isfinite(zero.mean) & np.isfinite(low.mean) & np.isfinite(full.mean)
-    measured &= layout.present.ravel()
+    measured &= layout.is_cell
     everywhere = measured & (zero.mean >= TOP)
     short = measured & (low.mean >= TOP) & ~everywhere
     tells = measured & ~short & ~everywhere & ~in_parallel(short, layout)

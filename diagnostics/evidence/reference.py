@@ -61,7 +61,7 @@ class Reference:
 
     def repeats(self, layout: SensorLayout) -> Patience:
         """Return how often healthy frames repeat."""
-        present = living(layout, self.dead).present.ravel()
+        present = living(layout, self.dead).is_cell
         loaded_from = np.where(present, self.scale.baseline + self.scale.near, np.inf)
         return Patience(self.patience, self.loaded_patience or self.patience, loaded_from)
 

@@ -163,7 +163,8 @@ def findings(
     frames = stream.intermittency
     blamed = _blamed(judgement, stream, rate)
     way = np.where(blamed.on_line, WAYS.index(COMES_AND_GOES), judgement.way)
-    refuted = np.where(blamed.by_pieces, _kinds()[way], -1)
+    kind = _kinds()[way]
+    refuted = np.where(blamed.by_pieces, kind, -1)
     drifts = blamed.by_pieces & (way == WAYS.index(DRIFTS))
     # what never left its rest agrees with a broken line, whatever is likeliest of it
     to_end = log.run >= min(HELD, len(log.record))
@@ -204,7 +205,7 @@ def findings(
         ),
         known=blamed.known,
         refuted=np.where(reads_more, -1, refuted),
-        unsure=_unsure(judgement, blamed, _kinds()[way]),
+        unsure=_unsure(judgement, blamed, kind),
         wire=np.where(blamed.on_line, failing.line, -1),
         of_wire=failing.probability,
         share=failing.share,

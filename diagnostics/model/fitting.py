@@ -75,6 +75,7 @@ class _Reference:
     Attributes:
         recordings: ``[T, D]`` each.
         record: of all of them.
+        symbols: of healthy cells.
         load, level, flat: of the record, ``[n, D]``.
         living: bool ``[D]``.
         fold: int, of each recording.
@@ -83,6 +84,7 @@ class _Reference:
 
     recordings: Recordings
     record: Record
+    symbols: Symbols
     load: Array
     level: NDArray[np.int8]
     flat: NDArray[np.int8]
@@ -95,14 +97,15 @@ class _Reference:
         cls,
         recordings: Recordings,
         record: Record,
-        symbols: Symbols,
         layout: SensorLayout,
         living: Mask,
         rng: np.random.Generator,
     ) -> _Reference:
         """Return the recordings as symbols, in folds."""
-        rest = symbols.rest
+        step = converter_step(recordings, layout)
+        rest = fit_rest(record, float(layout.full_scale), step, layout.pad_of, living)
         above = rest.above(record, rest.shared(record, living).offset)
+        symbols = Symbols.fit(above, rest, living)
         load = root_load(above, rest)
         level = symbols.levels(record, above, np.zeros(above.shape, bool))
         fold = rng.permutation(len(recordings)) % min(_FOLDS, len(recordings))
@@ -110,17 +113,18 @@ class _Reference:
         means = [
             ConditionalMean.fit(load[of_piece != k], layout, living) for k in range(fold.max() + 1)
         ]
-        return cls(recordings, record, load, level, symbols.flat(record), living, fold, means)
+        flat = symbols.flat(record)
+        return cls(recordings, record, symbols, load, level, flat, living, fold, means)
 
     @property
     def of_piece(self) -> Cells:
         """Fold of each piece, int ``[n]``."""
         return self.fold[self.record.recording]
 
-    def flatness(self, symbols: Symbols, chosen: Mask) -> Flatness:
+    def flatness(self, chosen: Mask) -> Flatness:
         """Return how flat the ``chosen`` pieces (bool ``[n]``) are."""
         return Flatness.fit(
-            symbols.group(self.level[chosen]),
+            self.symbols.group(self.level[chosen]),
             activity_of(self.level[chosen], self.flat[chosen], self.living),
             self.flat[chosen],
             before_of(self.flat, self.record)[chosen],
@@ -149,15 +153,15 @@ def fit_model(
     rng = np.random.default_rng(0)
     longest = max(map(len, recordings))
     recordings = _enough([np.asarray(one, np.float32) for one in recordings])
-    present = layout.present.ravel()
+    present = layout.is_cell
     length = frames_of_piece(recordings)
     record = record_of(recordings, length)
     ranges = np.fmax.reduce(record.high) - np.fmin.reduce(record.low)
     living = present & ~dead & (ranges > _LIVES * layout.full_scale)
     if len(recordings) < FEWEST or not living.any():
         return None
-    symbols = _symbols_of(recordings, record, layout, living)
-    reference = _Reference.of(recordings, record, symbols, layout, living, rng)
+    reference = _Reference.of(recordings, record, layout, living, rng)
+    symbols = reference.symbols
     load = reference.load
     whole = ConditionalMean.fit(load, layout, living)
     progress(0.1)
@@ -175,10 +179,10 @@ def fit_model(
         reference = replace(reference, record=record)
     log = Log(record, symbols, present, living)
     groups, chain = fit_groups(as_one, log, half)
-    held_out = _held_out(reference, symbols, examples, resting, chain)
+    held_out = _held_out(reference, examples, resting, chain)
     del examples  # a hundred megabytes of a large array
     progress(0.5)
-    flatness = reference.flatness(symbols, np.ones(len(record), bool))
+    flatness = reference.flatness(np.ones(len(record), bool))
     model = Model.of(symbols, flatness, predictor, length, longest, present, living, lines, groups)
     held_out.judge(model, reference.of_piece)
     observed = model.observed(log, living & log.received)
@@ -193,16 +197,6 @@ def fit_model(
         predictor=replace(predictor, mean=whole, network=network),
         flatness=flatness,
     )
-
-
-def _symbols_of(
-    recordings: Recordings, record: Record, layout: SensorLayout, living: Mask
-) -> Symbols:
-    """Return the symbols of the reference."""
-    step = converter_step(recordings, layout)
-    rest = fit_rest(record, float(layout.full_scale), step, layout.pad_of, living)
-    above = rest.above(record, rest.shared(record, living).offset)
-    return Symbols.fit(above, rest, living)
 
 
 def _enough(recordings: list[Array]) -> list[Array]:
@@ -240,7 +234,6 @@ class _HeldOut:
 
 def _held_out(
     reference: _Reference,
-    symbols: Symbols,
     examples: Sequence[Examples],
     resting: Array,
     chain: Array,
@@ -251,8 +244,8 @@ def _held_out(
     tables = []
     for k in range(min(_HALVES, len(examples))):
         others = [of_fold for i, of_fold in enumerate(examples) if i % _HALVES != k]
-        networks.append(Network.fit(*_together(others), symbols.n, _FEWER))
-        tables.append(reference.flatness(symbols, half != k))
+        networks.append(Network.fit(*_together(others), reference.symbols.n, _FEWER))
+        tables.append(reference.flatness(half != k))
     return _HeldOut(reference.means, networks, tables, resting, chain)
 
 

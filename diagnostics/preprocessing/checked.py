@@ -27,7 +27,7 @@ def axis_planes(layout: SensorLayout) -> tuple[SensorLayout, NDArray[np.intp]]:
     if layout.axes == 1:
         return layout, order
     rest = "middle" if layout.rest == "learn" else layout.rest
-    present = layout.present.ravel()[order]
+    present = layout.is_cell[order]
     pads = layout.pads * layout.axes
     return replace(
         layout,

@@ -84,7 +84,7 @@ def reads_enough(ranges: NDArray[np.float64], layout: SensorLayout) -> NDArray[n
 def shows_contacts(first: RecordingBlocks, log: RecordingBlocks, layout: SensorLayout) -> bool:
     """Return whether most cells are loaded in the ``first`` recordings of a log, by what loads
     there are in it: loads last, noise does not."""
-    present = layout.present.ravel()
+    present = layout.is_cell
     given = first.valid(layout.full_scale, present)
     before = _typical_range(given, present)
     typical = _typical_range(log.valid(layout.full_scale, present), present)

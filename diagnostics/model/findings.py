@@ -21,7 +21,7 @@ from diagnostics.model.objects import judged_with_objects
 from diagnostics.model.observed import HELD, Log
 from diagnostics.model.record import Mask
 from diagnostics.model.symbols import NOTHING
-from diagnostics.model.ways import DRIFTS, FLOATS, WAYS
+from diagnostics.model.ways import FLOATS, WAYS
 from diagnostics.model.ways.comes_and_goes import COMES_AND_GOES
 from diagnostics.model.ways.floats import floats_lately
 from diagnostics.model.ways.holds import expected
@@ -165,7 +165,7 @@ def findings(
     way = np.where(blamed.on_line, WAYS.index(COMES_AND_GOES), judgement.way)
     kind = _kinds()[way]
     refuted = np.where(blamed.by_pieces, kind, -1)
-    drifts = blamed.by_pieces & (way == WAYS.index(DRIFTS))
+    drifts = blamed.by_pieces & _drifts()[way]
     # what never left its rest agrees with a broken line, whatever is likeliest of it
     to_end = log.run >= min(HELD, len(log.record))
     holds = blamed.delivers & (blamed.faulty | to_end) & (refuted < 0)
@@ -262,6 +262,11 @@ def _kinds() -> NDArray[np.intp]:
     """Return the number of the kind of each way; -1: it holds a value, or drifts."""
     numbers: dict[FaultKind | None, int] = {kind: i for i, kind in enumerate(REFUTED_KINDS)}
     return np.array([numbers.get(way.kind, -1) for way in WAYS])
+
+
+def _drifts() -> Mask:
+    """Return of each way whether a cell that fails so does not come to rest, bool."""
+    return np.array([way.kind is FaultKind.DRIFT for way in WAYS])
 
 
 def _value(

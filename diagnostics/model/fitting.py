@@ -63,6 +63,8 @@ _LENGTHS = (3, 6, 6, 40)  # recordings of a log
 _SHORT = 6  # of a short one
 _DEAD = (0.0, 0.04, 0.08, 0.16)  # shares of the cells that are dead in it
 _EXCEED = 0.1  # healthy cells of a log exceed the limit of all
+_USUALLY = 0.95  # of the healthy cells
+_SHOWS = 1.0  # evidence of a way that one looks like
 
 Recordings = Sequence[NDArray[np.floating]]
 Examples = tuple[Array, NDArray[np.int8]]
@@ -392,13 +394,16 @@ class _Reached:
         self.units[number] = max(self.units[number], len(judgement.units.begins))
 
     def bound(self, model: Model) -> None:
-        """Let a model know it: of each cell, and what one of ten logs exceeds of all."""
+        """Let a model know it: of each cell, and what one of ten logs exceeds of all; and of which
+        ways hardly any healthy cell looks."""
         highest = self.highest.copy()
         cells = int(model.living.sum())
         for of_length, logs in zip(highest, self.every, strict=True):
             if logs:
                 tail = np.quantile(np.concatenate(logs, axis=1), 1 - _EXCEED / cells, axis=1)
                 np.maximum(of_length, tail[:, None], out=of_length)
+                usually = np.quantile(np.concatenate(logs, axis=1), _USUALLY, axis=1)
+                model.telling &= usually < _SHOWS
         model.highest = np.maximum.accumulate(highest)
         model.reached = np.maximum.accumulate(self.units)
 

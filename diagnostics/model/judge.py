@@ -99,6 +99,7 @@ class Model:
         highest: ``[2, ways, D]``, evidence of each way that a healthy cell reaches in a short log
             and in a long one.
         reached: int ``[2]``, units of these logs.
+        telling: bool ``[ways]``, those that few healthy cells of this array look like.
         lines, groups: of the array.
     """
 
@@ -112,6 +113,7 @@ class Model:
     odd: Array
     highest: Array
     reached: Cells
+    telling: Mask
     lines: Lines
     groups: Groups
 
@@ -132,6 +134,7 @@ class Model:
         odd = np.full(len(present), USUAL, np.float32)
         highest = np.zeros((2, len(WAYS), len(present)), np.float32)
         reached = np.ones(2, np.intp)
+        telling = np.ones(len(WAYS), bool)
         return cls(
             symbols,
             flatness,
@@ -143,6 +146,7 @@ class Model:
             odd,
             highest,
             reached,
+            telling,
             lines,
             groups,
         )
@@ -176,6 +180,8 @@ class Model:
         certain = []
         for i in chosen:
             evidence = floats if i == _FLOATS else WAYS[i].evidence(observed, units)
+            if not self.telling[i]:
+                evidence = np.minimum(evidence, 0)
             surely = within_limit(evidence, highest[i], longer)
             if WAYS[i].floats:
                 evidence = np.minimum(evidence, floats)

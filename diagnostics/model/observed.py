@@ -103,6 +103,20 @@ class Log:
         return found
 
     @cached_property
+    def finest(self) -> Array:
+        """Readings of a cell that differ by less are the same, but for its noise, ``[D]``."""
+        rest = self.symbols.rest
+        found: Array = np.maximum(max(rest.least, self.step / 2), rest.noise)
+        return found
+
+    @cached_property
+    def same_by_chance(self) -> Array:
+        """Log P(two readings of the level of each piece are the same), ``[n, D]``."""
+        ranges = self.symbols.ranges[self.level] * self.symbols.rest.full
+        found: Array = np.log(np.minimum(1, 2 * self.finest / ranges))
+        return found
+
+    @cached_property
     def flat(self) -> NDArray[np.int8]:
         """How flat each piece is, ``[n, D]``."""
         return self.symbols.flat(self.record)

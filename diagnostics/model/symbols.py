@@ -51,10 +51,15 @@ class Symbols:
     def agree(self, step: float) -> Array:
         """Return of each level the probability that two readings in it agree; ``step``: of the
         converter."""
-        ranges = np.diff(np.append(self.edges, 1.0) ** 2)
         same = max(2 * HOLDS * DITHER, step / self.rest.full)
-        agree = np.minimum(1, same / np.maximum(ranges, 1e-9))
-        found: Array = np.concatenate([[1.0], agree, [1.0, 1.0]]).astype(np.float32)
+        found: Array = np.minimum(1, same / self.ranges)
+        return found
+
+    @property
+    def ranges(self) -> Array:
+        """Share of full scale that the loads of each level span."""
+        spans = np.maximum(np.diff(np.append(self.edges, 1.0) ** 2), 1e-9)
+        found: Array = np.concatenate([[1e-9], spans, [1e-9, 1e-9]]).astype(np.float32)
         return found
 
     @property

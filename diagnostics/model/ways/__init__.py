@@ -8,10 +8,11 @@ from diagnostics.model.ways.copies import COPIES
 from diagnostics.model.ways.drift import DRIFTS
 from diagnostics.model.ways.floats import FLOATS
 from diagnostics.model.ways.holds import DITHERS, HOLDS
+from diagnostics.model.ways.keeps import KEEPS
 from diagnostics.model.ways.late import LATE, LATER
 from diagnostics.model.ways.way import Way
 from diagnostics.model.ways.weak import WEAK
 
-WAYS = (HOLDS, DITHERS, FLOATS, COMES_AND_GOES, LATE, LATER, CLAMPED, COPIES, WEAK, DRIFTS)
+WAYS = (HOLDS, DITHERS, FLOATS, COMES_AND_GOES, LATE, LATER, CLAMPED, KEEPS, COPIES, WEAK, DRIFTS)
 
-__all__ = ["COMES_AND_GOES", "DRIFTS", "FLOATS", "WAYS", "Way"]
+__all__ = ["COMES_AND_GOES", "FLOATS", "WAYS", "Way"]

@@ -10,9 +10,9 @@ from __future__ import annotations
 import numpy as np
 
 from diagnostics.faults import FaultKind
-from diagnostics.model.observed import Observed
+from diagnostics.model.observed import Log, Observed
 from diagnostics.model.over_time import Units, throughout
-from diagnostics.model.record import Array
+from diagnostics.model.record import Array, Mask
 from diagnostics.model.symbols import MOVES
 from diagnostics.model.ways.floats import no_more_than_floats
 from diagnostics.model.ways.way import Way
@@ -25,11 +25,23 @@ def _limit(observed: Observed) -> Array:
     return found
 
 
+def _again(log: Log, at: Mask) -> Array:
+    """Return the log ratio ``[n, D]`` of recordings that reach the limit as an earlier one did;
+    ``at``: bool ``[n, D]``, where readings are at it. The peaks of a healthy cell agree by chance.
+    """
+    count = np.cumsum(at, axis=0)
+    begins = np.maximum.accumulate(np.where(log.record.first, np.arange(len(at)), 0))
+    before = (count - at)[begins]
+    again = at & (count == before + 1) & (before > 0)
+    found: Array = np.where(again, -log.same_by_chance, 0)
+    return found
+
+
 def _evidence(observed: Observed, units: Units) -> Array:
     log = observed.log
     symbols = log.symbols
     limit = _limit(observed)
-    at = (log.record.high >= limit - symbols.rest.full * 1e-5) & (log.level > 0)
+    at = (log.record.high >= limit - log.finest) & (log.level > 0)
     at &= limit < symbols.rest.high - symbols.tolerance
     loads = observed.levels[..., : symbols.top + 1]
     at_least = np.flip(np.cumsum(np.flip(loads, -1), -1), -1)
@@ -38,7 +50,7 @@ def _evidence(observed: Observed, units: Units) -> Array:
     more = np.take_along_axis(at_least, level, 2)[..., 0]
     much_more = np.take_along_axis(at_least, level + _NEAR, 2)[..., 0]
     near = np.log(np.maximum(more - much_more, np.exp(observed.of_level)))
-    ratio = np.where(at, np.log(more) - near, 0)
+    ratio = np.where(at, np.log(more) - near, 0) + _again(log, at)
     still = ratio + np.where(at & (log.flat != MOVES), -observed.of_flatness, 0)
     # a healthy cell is still now and then, where it reads most
     moves_by_itself = no_more_than_floats(

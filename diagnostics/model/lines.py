@@ -11,11 +11,13 @@ are alike, and healthy lines are odd in some recordings: either side errs in a s
 that a fault shows in several. The worst line is left out of what the others say, and those are
 tested again.
 
-That nothing touches a pad is no surprise: cells of others tell of no line.
+That nothing touches a pad is no surprise: cells of others tell of no line, unless it is all of its
+pad: of such a one its own past and they are all that tells.
 
 Not detected: a line with fewer than three cells that move, or one of which carries most of its
-load; one without others on its pad that tell of it; one whose cells keep a load or another rest
-while it is away. A line that breaks once and for all is found by the values that its cells hold.
+load; one without others on its pad, where contacts often end while those of other pads last; one
+whose cells keep a load or another rest while it is away. A line that breaks once and for all is
+found by the values that its cells hold.
 """
 
 from __future__ import annotations
@@ -184,10 +186,11 @@ class Lines:
 
     def told(self, load: Array, known: Mask) -> Mask:
         """Return where a known cell beside those of a line is loaded on its pads, bool ``[n, W]``:
-        else what is loaded is the line itself, or nothing touches it."""
+        else what is loaded is the line itself, or nothing touches it. Of a line that is all of its
+        pads its own past tells, and what cells of other pads expect."""
         others = (self.others & known).astype(np.float32)
         found: Mask = (load > NOTHING).astype(np.float32) @ others.T > 0
-        return found
+        return found | ~self.others.any(axis=1)
 
     def ratio(self, observed: Observed, known: Mask, eligible: Mask) -> tuple[Array, Cells]:
         """Return the log ratio away : healthy of each piece, and the level of the expected load,

@@ -44,6 +44,26 @@ def test_a_dead_cell_that_moves_is_found_named_by_how_it_fails_and_no_other_cell
     assert [(fault.kind, fault.cells) for fault in found.faults] == [(kind, (cell,))]
 
 
+def test_a_cell_that_keeps_its_peak_to_the_end_of_each_recording_is_found_and_no_other_is(
+    fitted, log, used
+):
+    cell = int(used[0])
+    seen = [frames.copy() for frames in log]
+    for frames in seen:
+        frames[:, cell] = np.maximum.accumulate(frames[:, cell])
+    (fault,) = fitted.diagnose(seen).faults
+    assert (fault.kind, fault.cells) == (FaultKind.DRIFT, (cell,))
+
+
+def test_of_cells_that_end_at_a_limit_far_below_their_loads_none_is_called_alive(fitted, log, used):
+    for cell in used[5:50:5].tolist():
+        peak = max(frames[:, cell].max() for frames in log)
+        limited = Fault(FaultKind.CLAMPED, (cell,), value=0.3 * peak)
+        found = fitted.diagnose(broken(log, limited, fitted))
+        assert found.verdicts[cell] != Verdict.ALIVE or found.probability[cell] >= 0.1
+        assert found.fault_set <= {cell}
+
+
 def test_of_two_cells_that_read_the_same_the_one_that_contradicts_the_others_is_the_copy(
     fitted, log, used
 ):

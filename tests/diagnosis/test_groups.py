@@ -78,6 +78,20 @@ def diagnosed(
     return fitted.diagnose(log)
 
 
+def test_of_a_finger_that_goes_to_rest_in_every_second_recording_no_cell_is_called_alive(fitted):
+    rng = np.random.default_rng(3)
+    log = recordings(N_RECORDINGS, 2)
+    for finger in range(2):
+        seen = [frames.copy() for frames in log]
+        cells = slice(CELLS * finger, CELLS * (finger + 1))
+        for frames in seen[::2]:
+            at_rest = rng.normal(0, 1, (FRAMES - FAILS, CELLS))
+            frames[FAILS:, cells] = np.clip(np.rint(at_rest), 0, 255)
+        found = fitted.diagnose(seen)
+        assert not (found.verdicts[cells] == Verdict.ALIVE).any()
+        assert (found.verdicts == Verdict.ALIVE).sum() == LAYOUT.n_cells - CELLS
+
+
 def test_fingers_that_are_loaded_independently_are_tested_by_their_own_cells(fitted):
     found = fitted.diagnose(recordings(N_RECORDINGS, 2))
     assert found.faults == ()

@@ -12,7 +12,7 @@ import numpy as np
 from diagnostics.faults import FaultKind
 from diagnostics.model.observed import Log, Observed
 from diagnostics.model.over_time import Units, throughout
-from diagnostics.model.record import Array, Mask
+from diagnostics.model.record import Array, Cells, Mask
 from diagnostics.model.symbols import MOVES
 from diagnostics.model.ways.floats import no_more_than_floats
 from diagnostics.model.ways.way import Way
@@ -31,7 +31,7 @@ def _again(log: Log, at: Mask) -> Array:
     """
     count = np.cumsum(at, axis=0)
     begins = np.maximum.accumulate(np.where(log.record.first, np.arange(len(at)), 0))
-    before = (count - at)[begins]
+    before: Cells = (count - at)[begins]
     again = at & (count == before + 1) & (before > 0)
     found: Array = np.where(again, -log.same_by_chance, 0)
     return found

@@ -32,6 +32,7 @@ from diagnostics.model.record import Array, Cells, Mask, Record, Recorder, recor
 from diagnostics.model.rest import DITHER
 from diagnostics.model.symbols import NOTHING, Flatness, Symbols
 from diagnostics.model.ways import COMES_AND_GOES, FLOATS, WAYS, Way
+from diagnostics.preprocessing.levels import MAJORITY
 
 _SUSPECT = 3.0  # evidence of a fault with which a cell predicts no other
 _WORST = 0.5  # of the highest evidence: who leaves in one round
@@ -261,7 +262,7 @@ class Model:
             evidence=evidence,
             of_ways=of_ways,
             log_odds=log_odds,
-            probability=np.where(judged, _with_prevalence(log_odds, judged), 0.0),
+            probability=_with_prevalence(log_odds, judged),
             # limits say who is faulty, not of what
             way=_likeliest(_counting(of_ways, WAYS, only_held), log.run == len(log.record)),
             known=observed.known,
@@ -425,11 +426,12 @@ def _likeliest(evidence: Array, still: Mask) -> Cells:
 
 
 def _with_prevalence(log_odds: Floats, judged: Mask) -> Floats:
-    """Return P(faulty) ``[D]`` with the prevalence of the log."""
+    """Return P(faulty) ``[D]`` with the prevalence of the log, and no more than that of cells that
+    are not ``judged`` (bool ``[D]``)."""
     prevalence = _PREVALENCE
     found: Floats = expit(log_odds)
     for _ in range(_ITERATIONS):
         total = found[judged].sum() + _WEIGHS * _PREVALENCE
         prevalence = total / (judged.sum() + _WEIGHS)
         found = expit(log_odds + logit(prevalence) - logit(_PREVALENCE))
-    return found
+    return np.where(judged, found, np.minimum(found, min(prevalence, MAJORITY)))

@@ -13,6 +13,7 @@ from diagnostics.model.record import Array, Mask, Record
 from diagnostics.model.rest import DITHER
 from diagnostics.model.symbols import (
     MOVES,
+    NOTHING,
     Flatness,
     Symbols,
     activity_of,
@@ -282,16 +283,21 @@ class Observed:
     @cached_property
     def stays(self) -> Mask:
         """Where a cell stays while the load that known cells of its pad report stays, bool
-        ``[n, D]``: so does a healthy one, but not below its rest nor at the top, where no load
-        that stays holds it."""
+        ``[n, D]``: so does a healthy one, but not below its rest, nor at the top while no other
+        is loaded: no load that stays holds it there."""
         log = self.log
-        of_pad = self.predictor.on_pad(np.where(self.known, log.load, 0).astype(np.float32))
-        changes = np.abs(np.diff(log.above, axis=0, prepend=log.above[:1]))
+        load = np.where(self.known, log.load, 0).astype(np.float32)
+        of_pad = self.predictor.on_pad(load)
+        # an offset that is found anew moves nobody
+        every = np.stack([log.above, log.record.mean])
+        changes = np.abs(np.diff(every, axis=1, prepend=every[:, :1])).min(axis=0)
         dithers = changes <= DITHER * log.symbols.rest.full
         nobody_moves = self.predictor.on_pad((self.known & ~dithers).astype(np.float32)) == 0
         of_others = _same(of_pad) | nobody_moves
         stays = of_others & (_same(log.load) | dithers) & ~log.record.first[:, None]
-        found: Mask = stays & (log.level < log.symbols.top)
+        alone = of_pad - load <= NOTHING
+        top = log.symbols.top
+        found: Mask = stays & ((log.level < top) | ((log.level == top) & ~alone))
         return found
 
     def delayed(self, lag: int) -> Array:

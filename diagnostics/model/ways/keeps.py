@@ -3,7 +3,8 @@
 The mirror of a limit: a piece that reads what the cell read most before counts as any load up to
 that one, and two readings of a healthy cell are the same by chance. A reading below it denies it.
 
-Not detected: one whose contacts all last to the end of their recordings.
+Not detected: one whose contacts all last to the end of their recordings; one at the end of the
+range.
 """
 
 from __future__ import annotations
@@ -23,8 +24,9 @@ def _evidence(observed: Observed, units: Units) -> Array:
     record = log.record
     most = _most_before(record.high, record.first)
     falls = record.low < most - log.finest
-    keeps = ~falls & (record.high <= most + log.finest) & (log.level > 0)
     top = log.symbols.top
+    between = (log.level > 0) & (log.level < top)
+    keeps = ~falls & (record.high <= most + log.finest) & between
     up_to = np.cumsum(observed.levels[..., : top + 1], -1)
     level = np.minimum(log.level, top)[..., None].astype(np.intp)
     no_more = np.take_along_axis(up_to, level, 2)[..., 0]

@@ -195,3 +195,20 @@ def test_faults_in_grasps_that_never_let_go_are_no_objects(fitted, grasps: Recor
     found = fitted.diagnose([inject(grasps.frames[i], faults, LAYOUT) for i in order])
     assert not found.static_loads
     assert set(found.fault_set) == set(cells)
+
+
+def test_a_pose_that_is_held_for_long_blames_nobody_whatever_its_highest_cell_reads(
+    fitted, grasps: Recordings
+):
+    rng = np.random.default_rng(0)
+    highest = max(frames.max() for frames in grasps.frames[::2])
+    heavy = sorted(grasps.frames[1::2], key=lambda frames: -frames[len(frames) // 2].sum())[:6]
+    for number in range(6):
+        seen = []
+        for i, frames in enumerate(heavy):
+            pose = frames[len(frames) // 2].copy()
+            if i == number:
+                pose[pose.argmax()] = highest
+            jitter = LAYOUT.full_scale / 4095 * rng.integers(-1, 2, (300, len(pose))) * (pose > 0)
+            seen.append(np.concatenate([frames[: len(frames) // 2], pose + jitter]))
+        assert not fitted.diagnose(seen).fault_set

@@ -20,6 +20,7 @@ from diagnostics.model.groups import as_one_of, fit_groups
 from diagnostics.model.judge import Judgement, Model
 from diagnostics.model.lines import NO_HALF, Lines, fit_lines, odd_of
 from diagnostics.model.observed import Log, Observed
+from diagnostics.model.over_time import CERTAIN
 from diagnostics.model.predictor import CrossFittedNetwork, Network, Predictor
 from diagnostics.model.record import Array, Cells, Mask, Record, frames_of_piece, record_of
 from diagnostics.model.rest import fit_rest
@@ -64,7 +65,6 @@ _SHORT = 6  # of a short one
 _DEAD = (0.0, 0.04, 0.08, 0.16)  # shares of the cells that are dead in it
 _EXCEED = 0.1  # healthy cells of a log exceed the limit of all
 _USUALLY = 0.95  # of the healthy cells
-_SHOWS = 1.0  # evidence of a way that one looks like
 
 Recordings = Sequence[NDArray[np.floating]]
 Examples = tuple[Array, NDArray[np.int8]]
@@ -403,7 +403,7 @@ class _Reached:
                 tail = np.quantile(np.concatenate(logs, axis=1), 1 - _EXCEED / cells, axis=1)
                 np.maximum(of_length, tail[:, None], out=of_length)
                 usually = np.quantile(np.concatenate(logs, axis=1), _USUALLY, axis=1)
-                model.telling &= usually < _SHOWS
+                model.telling &= usually < CERTAIN
         model.highest = np.maximum.accumulate(highest)
         model.reached = np.maximum.accumulate(self.units)
 

@@ -100,7 +100,7 @@ class Model:
         highest: ``[2, ways, D]``, evidence of each way that a healthy cell reaches in a short log
             and in a long one.
         reached: int ``[2]``, units of these logs.
-        telling: bool ``[ways]``, those that few healthy cells of this array look like.
+        telling: bool ``[ways]``, those of which hardly any healthy cell of this array is certain.
         lines, groups: of the array.
     """
 

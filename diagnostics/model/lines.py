@@ -11,13 +11,12 @@ are alike, and healthy lines are odd in some recordings: either side errs in a s
 that a fault shows in several. The worst line is left out of what the others say, and those are
 tested again.
 
-That nothing touches a pad is no surprise: cells of others tell of no line, unless it is all of its
-pad: of such a one its own past and they are all that tells.
+That nothing touches a pad is no surprise: cells of others tell of no line. Of one that is all of
+its pad nobody else tells: they make its cells doubtful, and prove nothing.
 
 Not detected: a line with fewer than three cells that move, or one of which carries most of its
-load; one without others on its pad, where contacts often end while those of other pads last; one
-whose cells keep a load or another rest while it is away. A line that breaks once and for all is
-found by the values that its cells hold.
+load; one without others on its pad; one whose cells keep a load or another rest while it is away.
+A line that breaks once and for all is found by the values that its cells hold.
 """
 
 from __future__ import annotations
@@ -184,13 +183,18 @@ class Lines:
         found: Cells = around * _BEFORE + before
         return found
 
+    @property
+    def alone(self) -> Mask:
+        """Lines that are all of their pads, bool ``[W]``."""
+        return np.asarray(~self.others.any(axis=1))
+
     def told(self, load: Array, known: Mask) -> Mask:
         """Return where a known cell beside those of a line is loaded on its pads, bool ``[n, W]``:
         else what is loaded is the line itself, or nothing touches it. Of a line that is all of its
-        pads its own past tells, and what cells of other pads expect."""
+        pads, cells of others tell."""
         others = (self.others & known).astype(np.float32)
         found: Mask = (load > NOTHING).astype(np.float32) @ others.T > 0
-        return found | ~self.others.any(axis=1)
+        return np.asarray(found | self.alone)
 
     def ratio(self, observed: Observed, known: Mask, eligible: Mask) -> tuple[Array, Cells]:
         """Return the log ratio away : healthy of each piece, and the level of the expected load,
@@ -266,6 +270,8 @@ class Lines:
             known = observed.known & free
             evidence, of_blocks, ratio, blocks = self.evidence(observed, known, telling & free)
             evidence = within_limit(evidence, self.highest, len(record.units) / self.reached)
+            # that nothing touches a pad makes it doubtful, no more
+            evidence = np.where(self.alone, np.minimum(evidence, PROVEN), evidence)
             on = self.on & moving & free
             of_cell = np.where(on, evidence[:, None], 0).max(axis=0)
             failing = replace(failing, evidence=np.maximum(failing.evidence, of_cell))

@@ -20,7 +20,7 @@ from diagnostics.model.record import Array, Cells, Mask
 
 USUAL = 0.01  # share of the units in which a healthy cell is odd, before the reference tells
 _SURE = 30.0  # cells that this share is worth
-_CERTAIN = 6.0  # evidence that what is healthy does not reach
+CERTAIN = 6.0  # evidence that what is healthy does not reach
 _SAFETY = 1.5
 _RARELY = 0.001
 _OFTEN = 0.3
@@ -74,7 +74,7 @@ def within_limit(evidence: Array, highest: Array, longer: float) -> Array:
     """Return evidence so that what a healthy cell, or line, reaches stays below certainty, in a log
     that is so many times as long as those in which it did."""
     most = _SAFETY * max(1.0, longer) * highest
-    found: Array = evidence * np.where(evidence > 0, _CERTAIN / np.maximum(_CERTAIN, most), 1)
+    found: Array = evidence * np.where(evidence > 0, CERTAIN / np.maximum(CERTAIN, most), 1)
     return found
 
 

@@ -173,11 +173,13 @@ class Rest:
             finest = max(self.least, min(noise, float(np.median(self.noise[tell]))))
             middle, weight, surely = even(of_pad, noise, finest)
             beside = around(middle, weight >= 1, record)
-            # no load is negative: in a contact with most of a pad that sags, the lowest tell
+            # no load is negative, nor as even: in a contact with most of a pad the lowest tell
             lowest = of_pad[:, : len(tell) // 2 + 1]
             if lowest.shape[1] > _FEWEST:
-                of_lowest, sunk, _ = even(lowest, noise / 2, noise / 2)
-                beside = np.where((of_lowest < 0) & (sunk > 0), sunk * of_lowest, beside)
+                of_lowest, sunk, evenly = even(lowest, noise / 2, noise / 2)
+                enough = lowest.shape[1] >= 2 * _FEWEST
+                sure = np.where(of_lowest < 0, sunk, evenly * enough)
+                beside = np.where(sure > 0, sure * of_lowest, beside)
             shared = weight * middle + (1 - weight) * beside
             if self.pressed[cells].any():
                 lasts = throughout(middle, weight >= 1, record)

@@ -15,6 +15,9 @@ without it, in which one cell counts 4 at most. The log is of two sensors where
   cells of the pad rest 10 % of full scale apart, evenly;
 - neighbours differ independently: what lies on the array is no sensor.
 
+Where cells or wires are found faulty that another sensor would explain, less is enough
+(:mod:`diagnostics.sensor.other_gains`).
+
 Not detected: fewer than three recordings of a sensor, sensors that read alike, and gains where
 thresholds leave few loaded cells in a recording.
 """
@@ -34,6 +37,7 @@ from sklearn.covariance import ledoit_wolf
 from diagnostics.preprocessing.levels import CERTAIN_RATIO, FEWEST, LIGHT, MAJORITY, SLIGHT
 from diagnostics.preprocessing.readings import complete
 from diagnostics.sensor.gain import GAIN
+from diagnostics.sensor.other_gains import outliers_of_others
 from diagnostics.sensor.recalibration import (
     Fit,
     common_spread,
@@ -70,6 +74,8 @@ class AnotherSensor:
         pads: whose cells differ.
         n_pads: number of pads of the array.
         gains: whether gains differ too, not the rests alone.
+        is_certain: whether no other reason is known; else the cells of this one may have changed.
+        unlike: cells that differ by more than those of another sensor.
     """
 
     recordings: tuple[int, ...]
@@ -77,6 +83,8 @@ class AnotherSensor:
     pads: tuple[int, ...]
     n_pads: int
     gains: bool
+    is_certain: bool = True
+    unlike: tuple[int, ...] = ()
 
     @property
     def reason(self) -> str:
@@ -87,6 +95,8 @@ class AnotherSensor:
         what = f"another sensor{by}"
         if not self.gains:
             what += ", or from this one tared otherwise"
+        if not self.is_certain:
+            what += ", or from this one with many cells changed or touched otherwise,"
         if self.is_whole:
             return (
                 f"the recordings come from {what} than the reference: cells are judged by what"
@@ -117,6 +127,8 @@ def find_another_sensor(
     reference: Reference,
     layout: SensorLayout,
     excluded: Mask,
+    *,
+    suspect: bool = False,
 ) -> AnotherSensor | None:
     """Return which recordings of a log come from another sensor than the reference; None where the
     data do not tell.
@@ -127,6 +139,7 @@ def find_another_sensor(
         reference: fitted to them.
         layout: the array.
         excluded: bool ``[D]``, cells that are faulty.
+        suspect: cells or wires are found faulty that another sensor would explain.
     """
     if reference.model is None or not healthy:
         return None
@@ -146,7 +159,20 @@ def find_another_sensor(
         differing = [pad for pad in pads if pad in foreign or pad in differing]
         other[:] = True
     if not differing:
-        return None
+        unlike = None
+        if suspect:
+            unlike = outliers_of_others(both.ratio, both.precision, fit.pads, fit.used, len(usual))
+        if unlike is None:
+            return None
+        return AnotherSensor(
+            tuple(range(len(recordings))),
+            len(recordings),
+            tuple(range(layout.pads)),
+            layout.pads,
+            gains=True,
+            is_certain=False,
+            unlike=tuple(np.flatnonzero(unlike).tolist()),
+        )
     found = range(len(recordings)) if foreign else [numbers[i] for i in np.flatnonzero(other)]
     return AnotherSensor(
         tuple(found),

@@ -154,8 +154,8 @@ def _another(
         suspect: cells or wires are found faulty that another sensor would explain.
     """
     load = diagnoser.load_
-    unknown = diagnoser.layout.axes > 1 or (load is not None and load.direction == "middle")
-    if diagnoser.reference_ is None or unknown:
+    both_ways = diagnoser.layout.axes > 1 or (load is not None and load.direction == "middle")
+    if diagnoser.reference_ is None or (both_ways and not suspect):
         return None
     diagnosis = as_found.diagnosis
     frames = diagnoser.without_gain(as_found.frames) or as_found.frames
@@ -165,12 +165,13 @@ def _another(
     loads = as_loads(diagnoser, list(frames))
     reference = as_loads(diagnoser, healthy)
     asked = reference, diagnoser.reference_, diagnoser.layout, excluded
-    found = find_another_sensor(loads, *asked, suspect=suspect)
+    how = {"suspect": suspect, "both_ways": both_ways}
+    found = find_another_sensor(loads, *asked, **how)
     if found is None:
         return None
     # what all cells of a pad read more is an offset of it
     same_rest = _without_offsets(loads, reference, diagnoser.layout)
-    return None if find_another_sensor(same_rest, *asked, suspect=suspect) is None else found
+    return None if find_another_sensor(same_rest, *asked, **how) is None else found
 
 
 def _without_offsets(

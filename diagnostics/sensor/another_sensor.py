@@ -129,6 +129,7 @@ def find_another_sensor(
     excluded: Mask,
     *,
     suspect: bool = False,
+    both_ways: bool = False,
 ) -> AnotherSensor | None:
     """Return which recordings of a log come from another sensor than the reference; None where the
     data do not tell.
@@ -140,6 +141,7 @@ def find_another_sensor(
         layout: the array.
         excluded: bool ``[D]``, cells that are faulty.
         suspect: cells or wires are found faulty that another sensor would explain.
+        both_ways: load moves the readings up and down, so that their rests tell nothing.
     """
     if reference.model is None or not healthy:
         return None
@@ -153,8 +155,8 @@ def find_another_sensor(
     fit = Fit.of(reference, layout, used, usual)
     both = _Readings.of([*usual, *log], len(usual), fit)
     pads = [_Pad.of(both, on, len(usual), fit) for on in fit.pads if (on & used).any()]
-    other, differing = _split(pads, len(log))
-    foreign = [pad for pad in pads if pad.is_another(~other)]
+    other, differing = _split([] if both_ways else pads, len(log))
+    foreign = [pad for pad in pads if not both_ways and pad.is_another(~other)]
     if foreign:  # so the others are, too
         differing = [pad for pad in pads if pad in foreign or pad in differing]
         other[:] = True

@@ -75,7 +75,7 @@ def find_changed_readings(
         return ChangedReadings(None, None, left, _left(diagnoser.diagnose(left)), another=another)
     if disturbed and exchanged is None:
         return as_found if another is None else _as_another(as_found, another)
-    replaced = _with_new_gains(diagnoser, as_found, healthy, exchanged)
+    replaced = _with_new_gains(diagnoser, as_found, healthy, exchanged, another)
     if replaced is not None:
         return as_found if disturbed else replaced
     if another is not None:
@@ -229,9 +229,10 @@ def _with_new_gains(
     as_found: ChangedReadings,
     healthy: Sequence[NDArray[Any]],
     exchanged: ChangedReadings | None,
+    another: AnotherSensor | None,
 ) -> ChangedReadings | None:
     """Return a log with replaced pads undone; None where none is, or where exchanged wires explain
-    the log better."""
+    the log better. Cells of ``another`` sensor are judged as those of a replaced pad."""
     rival = None if exchanged is None else exchanged.frames
     recalibration = _recalibration(diagnoser, as_found, healthy, rival)
     if recalibration is None:
@@ -239,6 +240,9 @@ def _with_new_gains(
     full_scale = diagnoser.layout.full_scale
     undone = [recalibration.undo(recording, full_scale) for recording in as_found.frames]
     diagnosis = _of_any_sensor(diagnoser.diagnose(undone), recalibration.pads)
+    if another is not None:
+        others = set(another.pads) - set(recalibration.pads)
+        diagnosis = _of_any_sensor(diagnosis, sorted(others), another.unlike)
     return ChangedReadings(None, recalibration, undone, diagnosis, as_found)
 
 

@@ -160,29 +160,38 @@ def find_another_sensor(
     if foreign:  # so the others are, too
         differing = [pad for pad in pads if pad in foreign or pad in differing]
         other[:] = True
-    if not differing:
-        unlike = None
-        if suspect:
-            unlike = outliers_of_others(both.ratio, both.precision, fit.pads, fit.used, len(usual))
-        if unlike is None:
-            return None
+    if differing and not foreign:
+        found = tuple(numbers[i] for i in np.flatnonzero(other))
+        return AnotherSensor(found, len(recordings), *_of_pads(differing, other, layout))
+    unlike = None
+    if suspect:  # the pads that do not tell it by themselves
+        told = {pad.number for pad in differing}
+        rest = [one for i, one in enumerate(fit.pads) if i not in told]
+        left = fit.used & np.any(rest, axis=0) if rest else np.zeros_like(fit.used)
+        if left.any():
+            unlike = outliers_of_others(both.ratio, both.precision, rest, left, len(usual))
+    whole = tuple(range(len(recordings)))
+    if unlike is not None:
         return AnotherSensor(
-            tuple(range(len(recordings))),
+            whole,
             len(recordings),
             tuple(range(layout.pads)),
             layout.pads,
             gains=True,
-            is_certain=False,
+            is_certain=bool(differing),
             unlike=tuple(np.flatnonzero(unlike).tolist()),
         )
-    found = range(len(recordings)) if foreign else [numbers[i] for i in np.flatnonzero(other)]
-    return AnotherSensor(
-        tuple(found),
-        len(recordings),
-        tuple(pad.number for pad in differing),
-        layout.pads,
-        any(pad.gains_differ(pad.in_log(other), pad.usual) for pad in differing),
-    )
+    if not differing:
+        return None
+    return AnotherSensor(whole, len(recordings), *_of_pads(differing, other, layout))
+
+
+def _of_pads(
+    differing: Sequence[_Pad], other: Mask, layout: SensorLayout
+) -> tuple[tuple[int, ...], int, bool]:
+    """Return the numbers of pads, how many the array has, and whether gains differ."""
+    gains = any(pad.gains_differ(pad.in_log(other), pad.usual) for pad in differing)
+    return tuple(pad.number for pad in differing), layout.pads, gains
 
 
 def _split(pads: Sequence[_Pad], n: int) -> tuple[Mask, list[_Pad]]:

@@ -165,13 +165,13 @@ def _another(
     loads = as_loads(diagnoser, list(frames))
     reference = as_loads(diagnoser, healthy)
     asked = reference, diagnoser.reference_, diagnoser.layout, excluded
-    how = {"suspect": suspect, "both_ways": both_ways}
-    found = find_another_sensor(loads, *asked, **how)
+    found = find_another_sensor(loads, *asked, suspect=suspect, both_ways=both_ways)
     if found is None:
         return None
     # what all cells of a pad read more is an offset of it
     same_rest = _without_offsets(loads, reference, diagnoser.layout)
-    return None if find_another_sensor(same_rest, *asked, **how) is None else found
+    again = find_another_sensor(same_rest, *asked, suspect=suspect, both_ways=both_ways)
+    return None if again is None else found
 
 
 def _without_offsets(

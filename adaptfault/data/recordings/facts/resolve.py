@@ -271,7 +271,7 @@ def _most(values: Iterable[Any]) -> Any:
     held: dict[Any, Any] = {}
     for value in values:
         if value is not None:
-            key = value if isinstance(value, int | float | str) else repr(value)
+            key: Any = value if isinstance(value, int | float | str) else repr(value)
             if isinstance(value, np.ndarray):
                 key = value.tobytes()
             counts[key] += 1
@@ -329,7 +329,8 @@ def check_agreement(
         reference = getattr(usual, name)
         if value is not None and value != reference:
             raise _disagrees(content, name.replace("_", " "), value, reference)
-    if rate is None and content.rate is not None and not same_rate(content.rate, usual.rate):
+    stated = None if rate is not None else content.rate
+    if stated is not None and usual.rate is not None and not same_rate(stated, usual.rate):
         raise _disagrees(content, "rate", content.rate, usual.rate)
     if usual.in_range and not in_range(content) and content.largest > layout.full_scale:
         what = f"counts reach {content.largest:.0f}, more than 16 bits, and those of other files"

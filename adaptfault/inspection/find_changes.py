@@ -23,7 +23,6 @@ _OF_ANY_SENSOR = (
     FaultKind.OPEN,
     FaultKind.SHORT,
     FaultKind.STUCK,
-    FaultKind.INTERMITTENT,
     FaultKind.ALIAS,
     FaultKind.COPY,
 )
@@ -53,17 +52,20 @@ def find_changed_readings(
             one sensor from another.
     """
     exchanged = _put_back(diagnoser, frames)
-    if exchanged is not None and exchanged.rewiring is not None and comparable:
+    unexplained = False  # wires look exchanged, and that does not explain the log
+    if exchanged is not None and comparable:
         still = _another(diagnoser, exchanged, healthy)
-        if still is not None and still.is_whole:  # the wires do not explain it
+        if still is not None and (still.is_whole or exchanged.in_part is not None):
             exchanged = None
+            unexplained = True
     as_found = ChangedReadings(None, None, frames, diagnoser.diagnose(frames))
     if exchanged is not None and disturbed:
         explains = exchanged.diagnosis.n_lost < as_found.diagnosis.n_lost
         exchanged = exchanged if explains else None
     another = None
     if exchanged is None and comparable:
-        another = _another(diagnoser, as_found, healthy)
+        suspect = unexplained or _of_this_sensor(as_found.diagnosis)
+        another = _another(diagnoser, as_found, healthy, suspect=suspect)
         if another is None:
             own = _as_own_reference(diagnoser, as_found, healthy)
             if own is not None:
@@ -73,7 +75,7 @@ def find_changed_readings(
         return ChangedReadings(None, None, left, _left(diagnoser.diagnose(left)), another=another)
     if disturbed and exchanged is None:
         return as_found if another is None else _as_another(as_found, another)
-    replaced = _with_new_gains(diagnoser, as_found, healthy, exchanged)
+    replaced = _with_new_gains(diagnoser, as_found, healthy, exchanged, another)
     if replaced is not None:
         return as_found if disturbed else replaced
     if another is not None:
@@ -83,7 +85,7 @@ def find_changed_readings(
 
 def _as_another(as_found: ChangedReadings, another: AnotherSensor) -> ChangedReadings:
     """Return a log of another sensor."""
-    diagnosis = _of_any_sensor(as_found.diagnosis, another.pads)
+    diagnosis = _of_any_sensor(as_found.diagnosis, another.pads, another.unlike)
     return replace(as_found, diagnosis=diagnosis, another=another)
 
 
@@ -140,6 +142,7 @@ def _another(
     healthy: Sequence[NDArray[Any]],
     *,
     with_faulty: bool = False,
+    suspect: bool = False,
 ) -> AnotherSensor | None:
     """Return which recordings come from another sensor than the reference; None: none, or nothing
     tells.
@@ -148,10 +151,11 @@ def _another(
         diagnoser, as_found, healthy: of the log and the reference.
         with_faulty: also by cells that are faulty as the reference has it, which may be healthy
             ones of another sensor.
+        suspect: cells or wires are found faulty that another sensor would explain.
     """
     load = diagnoser.load_
-    unknown = diagnoser.layout.axes > 1 or (load is not None and load.direction == "middle")
-    if diagnoser.reference_ is None or unknown:
+    both_ways = diagnoser.layout.axes > 1 or (load is not None and load.direction == "middle")
+    if diagnoser.reference_ is None or (both_ways and not suspect):
         return None
     diagnosis = as_found.diagnosis
     frames = diagnoser.without_gain(as_found.frames) or as_found.frames
@@ -161,12 +165,13 @@ def _another(
     loads = as_loads(diagnoser, list(frames))
     reference = as_loads(diagnoser, healthy)
     asked = reference, diagnoser.reference_, diagnoser.layout, excluded
-    found = find_another_sensor(loads, *asked)
+    found = find_another_sensor(loads, *asked, suspect=suspect, both_ways=both_ways)
     if found is None:
         return None
     # what all cells of a pad read more is an offset of it
     same_rest = _without_offsets(loads, reference, diagnoser.layout)
-    return None if find_another_sensor(same_rest, *asked) is None else found
+    again = find_another_sensor(same_rest, *asked, suspect=suspect, both_ways=both_ways)
+    return None if again is None else found
 
 
 def _without_offsets(
@@ -187,16 +192,26 @@ def _without_offsets(
     return [frames - offset for frames in loads]
 
 
+def _of_this_sensor(diagnosis: Diagnosis) -> bool:
+    """Return whether a fault is told by how much cells of this sensor should read."""
+    return any(fault.kind not in _OF_ANY_SENSOR for fault in diagnosis.faults)
+
+
 def _left(diagnosis: Diagnosis) -> Diagnosis:
     """Return the diagnosis of a log of which recordings are left out: these are not lost."""
     transport = tuple(one for one in diagnosis.transport if one.kind != "lost")
     return replace(diagnosis, transport=transport)
 
 
-def _of_any_sensor(diagnosis: Diagnosis, pads: Sequence[int]) -> Diagnosis:
+def _of_any_sensor(
+    diagnosis: Diagnosis, pads: Sequence[int], unlike: Sequence[int] = ()
+) -> Diagnosis:
     """Return a diagnosis of pads that are not those of the reference: it tells which of their cells
-    hold a value or repeat another, not how much they should read."""
-    on = np.isin(diagnosis.layout.pad_of, pads)
+    hold a value or repeat another, not how much they should read, but of those that are
+    ``unlike`` any of them."""
+    on = np.isin(diagnosis.layout.pad_of, pads) & ~np.isin(
+        np.arange(diagnosis.layout.n_cells), unlike
+    )
     holds = [fault for fault in diagnosis.faults if fault.kind in _OF_ANY_SENSOR]
     faults = [fault for fault in diagnosis.faults if fault in holds or not on[[*fault.cells]].all()]
     untold = diagnosis.fault_set.mask.copy()
@@ -214,9 +229,10 @@ def _with_new_gains(
     as_found: ChangedReadings,
     healthy: Sequence[NDArray[Any]],
     exchanged: ChangedReadings | None,
+    another: AnotherSensor | None,
 ) -> ChangedReadings | None:
     """Return a log with replaced pads undone; None where none is, or where exchanged wires explain
-    the log better."""
+    the log better. Cells of ``another`` sensor are judged as those of a replaced pad."""
     rival = None if exchanged is None else exchanged.frames
     recalibration = _recalibration(diagnoser, as_found, healthy, rival)
     if recalibration is None:
@@ -224,6 +240,9 @@ def _with_new_gains(
     full_scale = diagnoser.layout.full_scale
     undone = [recalibration.undo(recording, full_scale) for recording in as_found.frames]
     diagnosis = _of_any_sensor(diagnoser.diagnose(undone), recalibration.pads)
+    if another is not None:
+        others = set(another.pads) - set(recalibration.pads)
+        diagnosis = _of_any_sensor(diagnosis, sorted(others), another.unlike)
     return ChangedReadings(None, recalibration, undone, diagnosis, as_found)
 
 

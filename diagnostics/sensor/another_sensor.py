@@ -15,6 +15,9 @@ without it, in which one cell counts 4 at most. The log is of two sensors where
   cells of the pad rest 10 % of full scale apart, evenly;
 - neighbours differ independently: what lies on the array is no sensor.
 
+Where cells or wires are found faulty that another sensor would explain, less is enough
+(:mod:`diagnostics.sensor.other_gains`).
+
 Not detected: fewer than three recordings of a sensor, sensors that read alike, and gains where
 thresholds leave few loaded cells in a recording.
 """
@@ -34,6 +37,7 @@ from sklearn.covariance import ledoit_wolf
 from diagnostics.preprocessing.levels import CERTAIN_RATIO, FEWEST, LIGHT, MAJORITY, SLIGHT
 from diagnostics.preprocessing.readings import complete
 from diagnostics.sensor.gain import GAIN
+from diagnostics.sensor.other_gains import outliers_of_others
 from diagnostics.sensor.recalibration import (
     Fit,
     common_spread,
@@ -70,6 +74,8 @@ class AnotherSensor:
         pads: whose cells differ.
         n_pads: number of pads of the array.
         gains: whether gains differ too, not the rests alone.
+        is_certain: whether no other reason is known; else the cells of this one may have changed.
+        unlike: cells that differ by more than those of another sensor.
     """
 
     recordings: tuple[int, ...]
@@ -77,6 +83,8 @@ class AnotherSensor:
     pads: tuple[int, ...]
     n_pads: int
     gains: bool
+    is_certain: bool = True
+    unlike: tuple[int, ...] = ()
 
     @property
     def reason(self) -> str:
@@ -87,6 +95,8 @@ class AnotherSensor:
         what = f"another sensor{by}"
         if not self.gains:
             what += ", or from this one tared otherwise"
+        if not self.is_certain:
+            what += ", or from this one with many cells changed or touched otherwise,"
         if self.is_whole:
             return (
                 f"the recordings come from {what} than the reference: cells are judged by what"
@@ -117,6 +127,9 @@ def find_another_sensor(
     reference: Reference,
     layout: SensorLayout,
     excluded: Mask,
+    *,
+    suspect: bool = False,
+    both_ways: bool = False,
 ) -> AnotherSensor | None:
     """Return which recordings of a log come from another sensor than the reference; None where the
     data do not tell.
@@ -127,6 +140,8 @@ def find_another_sensor(
         reference: fitted to them.
         layout: the array.
         excluded: bool ``[D]``, cells that are faulty.
+        suspect: cells or wires are found faulty that another sensor would explain.
+        both_ways: load moves the readings up and down, so that their rests tell nothing.
     """
     if reference.model is None or not healthy:
         return None
@@ -140,21 +155,43 @@ def find_another_sensor(
     fit = Fit.of(reference, layout, used, usual)
     both = _Readings.of([*usual, *log], len(usual), fit)
     pads = [_Pad.of(both, on, len(usual), fit) for on in fit.pads if (on & used).any()]
-    other, differing = _split(pads, len(log))
-    foreign = [pad for pad in pads if pad.is_another(~other)]
+    other, differing = _split([] if both_ways else pads, len(log))
+    foreign = [pad for pad in pads if not both_ways and pad.is_another(~other)]
     if foreign:  # so the others are, too
         differing = [pad for pad in pads if pad in foreign or pad in differing]
         other[:] = True
+    if differing and not foreign:
+        found = tuple(numbers[i] for i in np.flatnonzero(other))
+        return AnotherSensor(found, len(recordings), *_of_pads(differing, other, layout))
+    unlike = None
+    if suspect:  # the pads that do not tell it by themselves
+        told = {pad.number for pad in differing}
+        rest = [one for i, one in enumerate(fit.pads) if i not in told]
+        left = fit.used & np.any(rest, axis=0) if rest else np.zeros_like(fit.used)
+        if left.any():
+            unlike = outliers_of_others(both.ratio, both.precision, rest, left, len(usual))
+    whole = tuple(range(len(recordings)))
+    if unlike is not None:
+        return AnotherSensor(
+            whole,
+            len(recordings),
+            tuple(range(layout.pads)),
+            layout.pads,
+            gains=True,
+            is_certain=bool(differing),
+            unlike=tuple(np.flatnonzero(unlike).tolist()),
+        )
     if not differing:
         return None
-    found = range(len(recordings)) if foreign else [numbers[i] for i in np.flatnonzero(other)]
-    return AnotherSensor(
-        tuple(found),
-        len(recordings),
-        tuple(pad.number for pad in differing),
-        layout.pads,
-        any(pad.gains_differ(pad.in_log(other), pad.usual) for pad in differing),
-    )
+    return AnotherSensor(whole, len(recordings), *_of_pads(differing, other, layout))
+
+
+def _of_pads(
+    differing: Sequence[_Pad], other: Mask, layout: SensorLayout
+) -> tuple[tuple[int, ...], int, bool]:
+    """Return the numbers of pads, how many the array has, and whether gains differ."""
+    gains = any(pad.gains_differ(pad.in_log(other), pad.usual) for pad in differing)
+    return tuple(pad.number for pad in differing), layout.pads, gains
 
 
 def _split(pads: Sequence[_Pad], n: int) -> tuple[Mask, list[_Pad]]:

@@ -156,18 +156,55 @@ def offered(arrivals, **options):
     return asyncio.run(run())
 
 
-def test_invented_names_do_not_lock_a_device_out():
-    invented = [(f"invented{i}", 0.0, "10.0.0.66", 0.0) for i in range(16)]
-    robot = [("robot", i / 10, "10.0.0.1", i / 10) for i in range(100)]
-    receiver, frames = offered(invented + robot)
+def steadily(name, begin, end, each, address="10.0.0.66"):
+    """Return arrivals of a name that sends every ``each`` seconds."""
+    times = np.arange(begin, end, each)
+    return [(name, float(at), address, float(at)) for at in times]
+
+
+INVENTED = {
+    "sixteen names at once": [(f"x{i}", 0.0, "10.0.0.66", 0.0) for i in range(16)],
+    "thirty a second": [(f"x{i}", 0.0, "10.0.0.66", i / 30) for i in range(360)],
+    "a thousand a second": [(f"x{i}", 0.0, "10.0.0.66", i / 1000) for i in range(12_000)],
+    "names that send twice": [
+        (f"x{i // 2}", float(i % 2), "10.0.0.66", i / 60) for i in range(720)
+    ],
+    "sixteen names kept alive": [
+        one for i in range(16) for one in steadily(f"x{i}", i / 10, 12.0, 1.9)
+    ],
+    "its own name, from elsewhere": [
+        *((f"x{i}", 0.0, "10.0.0.66", 0.0) for i in range(15)),
+        *steadily("robot", 0.05, 12.0, 1.0),
+    ],
+}
+
+
+@pytest.mark.parametrize("how", INVENTED)
+def test_invented_names_do_not_lock_a_device_out(how):
+    robot = steadily("robot", 2.0, 12.0, 0.1, "10.0.0.1")
+    arrivals = sorted(INVENTED[how] + robot, key=lambda one: one[3])
+    receiver, frames = offered(arrivals, queue=20_000)
+    assert sum(frame.device == "robot" for frame in frames) >= 95  # of 100
     counters = receiver.counters
-    assert sum(frame.device == "robot" for frame in frames) == 80  # from 2 s on
-    assert (counters.received, counters.kept, counters.refused, counters.devices) == (
-        116,
-        96,
-        20,
-        16,
-    )
+    assert (counters.received, counters.devices) == (len(arrivals), 16)
+    assert counters.received == sum(getattr(counters, name) for name in ("kept", *FAULTS))
+
+
+def test_a_device_that_pauses_while_names_are_invented_is_back_at_once():
+    robot = steadily("robot", 0.0, 5.0, 0.1, "10.0.0.1")
+    robot += steadily("robot", 12.0, 17.0, 0.1, "10.0.0.1")
+    invented = [(f"x{i}", 0.0, "10.0.0.66", 5 + i / 30) for i in range(300)]
+    invented += [one for i in range(16) for one in steadily(f"y{i}", 5.05, 17.0, 0.5)]
+    _, frames = offered(sorted(robot + invented, key=lambda one: one[3]), queue=5000)
+    assert sum(frame.device == "robot" for frame in frames) == 100
+
+
+def test_devices_that_send_keep_their_places_whoever_comes_and_how_often():
+    arrivals = [one for i in range(16) for one in steadily(f"d{i}", 0.003 * i, 20.0, 0.1)]
+    late = steadily("late", 0.05, 20.0, 0.02, "10.0.0.9")
+    receiver, frames = offered(sorted(arrivals + late, key=lambda one: one[3]), queue=5000)
+    assert {frame.device for frame in frames} == {f"d{i}" for i in range(16)}
+    assert receiver.counters.refused == len(late)
 
 
 def test_a_device_that_sends_is_not_evicted():

@@ -187,7 +187,7 @@ def test_rates_that_differ_by_the_jitter_of_measurement_are_the_same(tmp_path):
     write_bag(tmp_path / "c", tactile(newtons(20)), rate=15.0)
     loaded = load(tmp_path)
     assert len(loaded.recordings) == 2
-    assert "rate 15.0 where the files before it have 10.0" in loaded.problems[0].message
+    assert "rate 15.0 where other files have 10.0" in loaded.problems[0].message
 
 
 def test_messages_of_another_width_are_left_out_and_counted(tmp_path):

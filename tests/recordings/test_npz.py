@@ -462,7 +462,7 @@ def test_files_of_another_array_are_left_out(tmp_path):
     assert len(loaded.recordings) == 6
     other, faster = messages(loaded, "error")
     assert "2.npz: frames of 2 x 2 x 3 (pads x rows x cols) where the layout has 1 x 2 x 3" in other
-    assert "4.npz: rate 30.0 where the files before it have 20.0" in faster
+    assert "4.npz: rate 30.0 where other files have 20.0" in faster
 
 
 def test_recordings_without_labels_beside_labelled_ones_leave_all_without(tmp_path):

@@ -140,6 +140,11 @@ def rows(values=None):
     return pa.array((readings() if values is None else values).reshape(12, -1).tolist())
 
 
+def bag_without_files(path):
+    path.mkdir()
+    text(path / "metadata.yaml", "rosbag2_bagfile_information:\n  version: 9\n")
+
+
 def cells(*values):
     held = np.empty((1, len(values)), object)
     held[0, :] = values
@@ -219,6 +224,14 @@ ODD = {
     "records.npy": lambda p: np.save(p, np.zeros(12, [("a", "f4")])),
     "complex.npz": lambda p: np.savez(p, frames=np.ones((3, 4, 12), np.complex64)),
     "texts.npz": lambda p: np.savez(p, frames=["a", "b"]),
+    "numbers_huge.parquet": lambda p: parquet(p, tactile=rows(np.full((12, 12), 2**40))),
+    "numbers_huge.csv": lambda p: text(p, f"{','.join(['70000000'] * 12)}\n" * 9),
+    "first.bag": lambda p: text(p, "#ROSBAG V2.0\n"),
+    "no_files_bag": bag_without_files,
+    "no_folder.zarr": lambda p: text(p, "PK"),
+    "no_description.zarr": lambda p: p.mkdir(),
+    "link.csv": lambda p: p.symlink_to("nowhere.csv"),
+    "circle.h5": lambda p: p.symlink_to(p),
 }
 
 
@@ -240,6 +253,31 @@ def test_no_valid_odd_file_loses_the_good_one_and_each_is_read_or_named(before, 
         assert is_read or any(name in one for one in told), name
     assert not [one for one in told if "\n" in one]
     assert not [one for one in told if "broadcast" in one or "a sequence" in one]
+
+
+@pytest.mark.parametrize(
+    "odd",
+    [
+        {"rate": 77.0},
+        {"full_scale": 5.0, "unit": "V"},
+        {"present": np.arange(12).reshape(1, 3, 4) < 9},
+        {"frames": np.full((9, 12), 2**33)},
+    ],
+)
+@pytest.mark.parametrize("name", ["0", "z"])
+def test_the_file_that_is_not_as_most_are_is_left_out_wherever_it_stands(odd, name, tmp_path):
+    usual = {"frames": readings(9).reshape(9, -1), "rate": 20.0, "unit": "count"}
+    usual |= {"full_scale": 1023.0, "present": np.ones((1, 3, 4), bool)}
+    if "frames" in odd:
+        del usual["full_scale"], usual["unit"]
+    archive(tmp_path / f"{name}_odd.npz", **(usual | odd))
+    for i in range(2):
+        archive(tmp_path / f"good_{i}.npz", **usual)
+    loaded = load(tmp_path)
+    assert loaded.recordings.names == ("good_0.npz", "good_1.npz")
+    (told,) = messages(loaded, "error")
+    assert f"{name}_odd.npz" in told
+    assert "load them apart" in told
 
 
 @settings(max_examples=40, deadline=None)

@@ -5,6 +5,7 @@ import pytest
 
 import adaptfault as af
 from diagnostics import Fault, SelfDiagnosis, SensorLayout, inject
+from diagnostics.sensor.other_gains import outliers_of_others
 
 LAYOUT = SensorLayout(1, 6, 6, full_scale=1023.0, unit="count", rate=20.0)
 
@@ -175,3 +176,66 @@ def test_exchanged_wires_and_dead_cells_of_the_own_pad_are_no_other_pad(fitted_t
     found = af.inspect(weak, fitted_to_slides, reference=slid)
     assert "another_sensor" not in {finding.name for finding in found.findings}
     assert set(found.diagnosis.fault_set) == worn
+
+
+@pytest.mark.parametrize(("spread", "seed"), [(0.15, 1), (0.15, 2), (0.2, 0), (0.2, 1), (0.2, 2)])
+def test_a_pad_whose_cells_differ_little_in_gain_blames_no_healthy_cell(
+    fitted_to_slides, slid, spread, seed
+):
+    gains = np.exp(spread * np.random.default_rng(seed).normal(size=63))
+    log = [with_gains(one, gains) for one in slides(3, 24, sensor=OWN)]
+    found = af.inspect(log, fitted_to_slides, reference=slid)
+    told = {finding.name for finding in found.findings}
+    assert {"replaced_pad", "another_sensor"} & told
+    assert not {"rewired", "transposed", "swapped_in_part", "fault", "wire"} & told
+    assert not found.diagnosis.fault_set
+
+
+def with_gains(frames: np.ndarray, gains: np.ndarray) -> np.ndarray:
+    """Return frames of the own pad as one with other gains reads them."""
+    rest = np.random.default_rng(OWN).uniform(20, 60, 63)
+    return np.clip(np.rint(rest + gains * (frames - rest)), 0, 4095)
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_what_stands_out_among_the_cells_of_another_pad_is_found_and_a_held_cell_too(
+    fitted_to_slides, slid, seed
+):
+    gains = np.exp(0.15 * np.random.default_rng(seed).normal(size=63))
+    gains[30] = 0.1
+    log = [with_gains(one, gains) for one in slides(3, 24, sensor=OWN)]
+    for one in log:
+        one[:, 12] = 40
+    found = af.inspect(log, fitted_to_slides, reference=slid)
+    assert set(found.diagnosis.fault_set) == {12, 30}
+
+
+def log_ratios(seed: int, spread: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return log ratios of 30 recordings of a reference and 24 of a log, and their precisions."""
+    rng = np.random.default_rng(seed)
+    ratio = rng.normal(0, 0.2, (54, 40))
+    ratio[30:] += spread * rng.normal(size=40)
+    return ratio, np.where(rng.random((54, 40)) < 0.6, 25.0, 0.0)
+
+
+def others(ratio: np.ndarray, precision: np.ndarray) -> np.ndarray | None:
+    pads = [np.arange(40) < 20, np.arange(40) >= 20]
+    return outliers_of_others(ratio, precision, pads, np.ones(40, bool), 30)
+
+
+def test_of_one_sensor_hardly_a_log_looks_as_of_another_and_of_others_most_do():
+    assert sum(others(*log_ratios(seed, 0.0)) is not None for seed in range(40)) <= 2
+    found = [others(*log_ratios(seed, 0.15)) for seed in range(10)]
+    assert all(one is not None for one in found)
+    assert sum(int(one.sum()) for one in found) <= 2
+
+
+def test_a_cell_stands_out_by_what_cells_of_the_log_differ():
+    ratio, precision = log_ratios(3, 0.15)
+    ratio[30:, 7] -= 2.0
+    found = others(ratio, precision)
+    assert found is not None
+    assert found[7]
+    ratio, precision = log_ratios(3, 0.0)
+    assert others(ratio[:34], precision[:34]) is None  # too few recordings
+    assert others(ratio, precision * 0) is None

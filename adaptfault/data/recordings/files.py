@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import os
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,6 +14,17 @@ from adaptfault.data.recordings.facts.labels import TABLE, TARGETS, natural_key
 from adaptfault.data.recordings.readers import Reader, reader_of, suffixes
 
 _log = logging.getLogger(__name__)
+
+_UNREAD = {
+    ".bag": "is a bag of ROS 1: left out; rosbags-convert (pip install rosbags) makes one of ROS 2"
+    " of it, which is read",
+    ".zarr": "is no Zarr store, as nothing in it describes one: left out; copy it whole, or let the"
+    " name of an archive end in .zarr.zip",
+}
+_BAG = "metadata.yaml"  # of a bag of ROS 2; what it begins with, in so many bytes:
+_OF_BAG = b"rosbag2_bagfile_information"
+_HEAD = 1000
+_NO_BAG = "describes a bag, and no file of one lies beside it: left out; copy the whole folder"
 
 
 @dataclass(frozen=True)
@@ -76,12 +88,12 @@ def find(
                 place = one.path.resolve()
                 if place not in aside:
                     found.setdefault(place, one)
-            if len(found) == before:
+            if len(found) == before and not _unread(path):
                 what = f"the folder holds no recordings; expected files that end in {endings}"
                 problems.append(Problem("error", located(path, what)))
         else:
             what = f"is no recording; expected a folder or a file that ends in {endings}"
-            problems.append(Problem("error", located(path, what)))
+            problems.append(Problem("error", located(path, _unread(path) or what)))
     for one in found.values():
         _log.debug("%s: read by %s", one.path, getattr(one.reader, "__name__", one.reader))
     return list(found.values())
@@ -100,6 +112,11 @@ def _below(root: Path, known: Mapping[str, Reader], problems: list[Problem]) -> 
     seen: set[str] = set()
     for folder, folders, names in os.walk(root, onerror=unreadable, followlinks=True):
         seen.add(os.path.realpath(folder))  # a link may lead back to a folder above it
+        unread = _unread(Path(folder))
+        if unread:
+            problems.append(Problem("error", located(folder, unread)))
+            folders.clear()
+            continue
         below = []
         for name in folders:
             path = Path(folder, name)
@@ -114,18 +131,43 @@ def _below(root: Path, known: Mapping[str, Reader], problems: list[Problem]) -> 
         for name in names:
             path = Path(folder, name)
             reader = reader_of(path, known, is_folder=False)
-            if reader is not None and not name.startswith(".") and path.is_file():
-                files.append((path, reader))
-            elif reader is not None and not name.startswith(".") and path.exists():
-                what = "is a pipe, a device or a socket, no file: passed over"
-                problems.append(Problem.warning(path, what))
-            else:
+            unread = _unread(path) or _no_file(path)
+            if name.startswith(".") or (reader is None and not _unread(path)):
                 _log.debug("%s: passed over", path)
+            elif unread:
+                problems.append(Problem("error", located(path, unread)))
+            elif reader is not None:
+                files.append((path, reader))
     files.sort(key=lambda file: [natural_key(part) for part in file[0].relative_to(root).parts])
     labels = table if table.is_file() else None
     for path, reader in files:
         if path not in (table, root / TARGETS):
             yield Found(path, path.relative_to(root).as_posix(), root, reader, labels)
+
+
+def _unread(path: Path) -> str:
+    """Return why a file or folder that no reader takes is left out; empty: its name says nothing of
+    recordings."""
+    suffix = path.suffix.lower()
+    if not path.is_dir():
+        return _UNREAD.get(suffix, "")
+    if suffix == ".zarr":
+        return _UNREAD[suffix]
+    with suppress(OSError):
+        described = path / _BAG
+        if described.is_file():
+            with described.open("rb") as file:
+                return _NO_BAG if _OF_BAG in file.read(_HEAD) else ""
+    return ""
+
+
+def _no_file(path: Path) -> str:
+    """Return why a name of a folder is no file; empty: it is one."""
+    if path.is_file():
+        return ""
+    if path.exists():
+        return "is a pipe, a device or a socket, no file: left out"
+    return "is a link to a file that is not there: left out; copy what it leads to"
 
 
 def passed_over(notes: Sequence[Path]) -> list[Problem]:

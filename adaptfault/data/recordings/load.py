@@ -26,6 +26,7 @@ from adaptfault.data.recordings.facts.classes import label_files
 from adaptfault.data.recordings.facts.infer import PAPER, SLACK
 from adaptfault.data.recordings.facts.layout_file import LAYOUT_NAME, layout_beside, not_stated
 from adaptfault.data.recordings.facts.resolve import (
+    Usual,
     check_agreement,
     check_statements,
     given_array,
@@ -348,9 +349,10 @@ def _usable(
         InputError: none can be used.
     """
     usable = []
+    usual = Usual.of(contents)
     for content in contents:
         with noted(problems):
-            check_agreement(content, contents, calibrated, rate)
+            check_agreement(content, usual, layout, calibrated, rate)
             check_width(content, layout, beside, strict=strict)
             if strict:
                 check_statements(content, layout, calibrated)

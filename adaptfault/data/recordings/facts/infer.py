@@ -160,8 +160,9 @@ def infer_scale(contents: Sequence[Content], shape: Shape) -> Scale:
     to two digits.
 
     Raises:
-        InputError: no reading is above 0, or counts exceed 16 bits.
+        InputError: no reading is above 0, or counts of all files exceed 16 bits.
     """
+    contents = [content for content in contents if in_range(content)] or contents
     content = max(contents, key=lambda one: one.largest)
     largest = content.largest
     whole = all(content.counts for content in contents)
@@ -186,6 +187,12 @@ def infer_scale(contents: Sequence[Content], shape: Shape) -> Scale:
         )
     full_scale = 1.0 if 0.5 < largest <= 1 else _rounded_up(largest)
     return Scale(full_scale, NO_UNIT, f"largest reading {largest:.4g}, no converter step visible")
+
+
+def in_range(content: Content) -> bool:
+    """Return whether a converter of 16 bits gives the counts of a file; readings that are none
+    may be anything."""
+    return not content.counts or _bits(content.largest) is not None
 
 
 def default_unit(full_scale: float, shape: Shape, contents: Sequence[Content]) -> str:

@@ -4,17 +4,21 @@ inference."""
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from adaptfault.data.printable import printable
 from adaptfault.data.recordings.errors import InputError, Problem
 from adaptfault.data.recordings.facts.infer import (
     default_unit,
+    in_range,
     infer_scale,
     infer_shape,
     sides,
@@ -77,7 +81,7 @@ def resolve_layout(
     if isinstance(array, SensorLayout):
         shape = array.shape
         stated = {name: getattr(array, name) for name in (*options, *_KEPT)}
-        stated |= {name: _first(getattr(c.facts, name) for c in contents) for name in unstated}
+        stated |= {name: _most(getattr(c.facts, name) for c in contents) for name in unstated}
     else:
         shape, reason = (array, "") if array else infer_shape(contents)
         if reason:
@@ -116,7 +120,7 @@ def _of_files(contents: Sequence[Content], shape: Shape, options: Iterable[str])
     """Return what the files of a shape state."""
     fitting = [content for content in contents if content.shape in (None, shape)]
     names = (*options, "present")
-    stated = {name: _first(getattr(one.facts, name) for one in fitting) for name in names}
+    stated = {name: _most(getattr(one.facts, name) for one in fitting) for name in names}
     declared = [one.facts.declared for one in fitting if one.facts.declared]
     return stated | dict(next(iter(declared), {}))
 
@@ -182,7 +186,7 @@ def _of_readers(contents: Sequence[Content]) -> list[str]:
 
 def _with_axes(contents: Sequence[Content], shape: Shape) -> Shape:
     """Return a shape with the axes of each position, where it counts positions alone."""
-    axes = _first(content.facts.declared.get("axes") for content in contents) or 1
+    axes = _most(content.facts.declared.get("axes") for content in contents) or 1
     pads, rows, cols = shape
     if all(content.width == axes * math.prod(shape) for content in contents):
         return pads, rows, cols * axes
@@ -261,41 +265,86 @@ def _contradicted(
     return [Problem.warning(content.path, f"{what}, but {used}")]
 
 
-def _first(values: Iterable[Any]) -> Any:
-    return next((value for value in values if value is not None), None)
+def _most(values: Iterable[Any]) -> Any:
+    """Return what most values are, of several the first; None: unknown."""
+    counts: Counter[Any] = Counter()
+    held: dict[Any, Any] = {}
+    for value in values:
+        if value is not None:
+            key: Any = value if isinstance(value, int | float | str) else repr(value)
+            if isinstance(value, np.ndarray):
+                key = value.tobytes()
+            counts[key] += 1
+            held.setdefault(key, value)
+    return held[max(counts, key=counts.__getitem__)] if counts else None
+
+
+@dataclass(frozen=True)
+class Usual:
+    """What most files state.
+
+    Attributes:
+        full_scale, unit, rate: None: no file states it.
+        present: by shape.
+        in_range: whether the counts of a file have at most 16 bits.
+    """
+
+    full_scale: float | None
+    unit: str | None
+    rate: float | None
+    present: Mapping[Shape | None, NDArray[np.bool_]]
+    in_range: bool
+
+    @classmethod
+    def of(cls, contents: Sequence[Content]) -> Usual:
+        """Return what most of some files state."""
+        masks: dict[Shape | None, list[NDArray[np.bool_]]] = {}
+        for content in contents:
+            if content.facts.present is not None:
+                masks.setdefault(content.shape, []).append(content.facts.present)
+        return cls(
+            _most(content.facts.full_scale for content in contents),
+            _most(content.facts.unit for content in contents),
+            _most(content.rate for content in contents),
+            {shape: _most(of_shape) for shape, of_shape in masks.items()},
+            any(map(in_range, contents)),
+        )
 
 
 def check_agreement(
-    content: Content, contents: Sequence[Content], calibrated: bool, rate: float | None
+    content: Content, usual: Usual, layout: SensorLayout, calibrated: bool, rate: float | None
 ) -> None:
-    """Raise InputError if a file contradicts the first file that states the same fact: they are of
-    different arrays.
+    """Raise InputError if a file contradicts what most files state or hold: they are of different
+    arrays.
 
     Args:
         content: of the file.
-        contents: of all files.
+        usual: of all files.
+        layout: the array.
         calibrated: the scale of counts does not matter: the tables define it.
         rate: as the user states it; then that of the files does not matter.
     """
     for name in () if calibrated else ("full_scale", "unit"):
         value = getattr(content.facts, name)
-        reference = _first(getattr(other.facts, name) for other in contents)
+        reference = getattr(usual, name)
         if value is not None and value != reference:
             raise _disagrees(content, name.replace("_", " "), value, reference)
-    reference = _first(other.rate for other in contents)
-    if rate is None and content.rate is not None and not same_rate(content.rate, reference):
-        raise _disagrees(content, "rate", content.rate, reference)
+    stated = None if rate is not None else content.rate
+    if stated is not None and usual.rate is not None and not same_rate(stated, usual.rate):
+        raise _disagrees(content, "rate", content.rate, usual.rate)
+    if usual.in_range and not in_range(content) and content.largest > layout.full_scale:
+        what = f"counts reach {content.largest:.0f}, more than 16 bits, and those of other files"
+        raise InputError.at(content.path, f"{what} do not; load them apart")
     if content.facts.present is None:
         return
-    reference = _first(other.facts.present for other in contents if other.shape == content.shape)
-    if not np.array_equal(content.facts.present, reference):
+    if not np.array_equal(content.facts.present, usual.present[content.shape]):
         raise InputError.at(
-            content.path, "another mask of present cells than the files before it; load them apart"
+            content.path, "another mask of present cells than other files; load them apart"
         )
 
 
 def _disagrees(content: Content, name: str, came: object, expected: object) -> InputError:
-    what = f"{name} {came} where the files before it have {expected}; load them apart"
+    what = f"{name} {came} where other files have {expected}; load them apart"
     return InputError.at(content.path, f"{what}, or give --rate" if name == "rate" else what)
 
 

@@ -22,6 +22,7 @@ from adaptfault.acquisition.packet import (
     longest_packet,
     parse_packet,
 )
+from adaptfault.acquisition.senders import Senders
 from diagnostics import SensorLayout
 
 MOST_DEVICES = 16
@@ -30,7 +31,7 @@ QUEUE = 1024
 _KERNEL_BUFFER = 4 << 20
 _TURNS = 8  # of the event loop for each frame fetched; each turn reads one datagram
 _BOUND = 10.0  # seconds of silence after which a device may send from another address
-_IDLE = 2.0  # seconds of silence after which a device may give its place to another one
+_IDLE = 2.0  # seconds of silence after which a device may give its place to any other one
 _TICK = 0.05  # seconds between checks for held packets
 _TELL = 10.0  # seconds between two lines about packets that are not taken
 
@@ -167,6 +168,7 @@ class Intake:
         self.key = key
         self._queue: deque[Frame] = deque(maxlen=queue)
         self._devices: dict[str, _Device] = {}
+        self._senders = Senders(layout.rate)
         self._counts: Counter[str] = Counter()  # those of devices that are forgotten among them
         self._dropping = _Dropping(on_trouble)
 
@@ -189,7 +191,8 @@ class Intake:
         address ``sender``.
 
         A device is bound to the address that it sends from first: packets with its name from other
-        addresses are refused until it has been silent for 10 s.
+        addresses are refused until it has been silent for 10 s, or is overdue and another address
+        has sent for a longer time.
         """
         self._counts["received"] += 1
         longest = longest_packet(self.layout.n_cells)
@@ -216,10 +219,13 @@ class Intake:
         """Return the device that sends from an address; None: its packets are refused."""
         if self.devices is not None and self.devices.get(name, "none") not in (None, sender):
             return None
+        lasted = self._senders.heard(name, sender, now)
         device = self._devices.get(name)
         if device is not None:
-            return device if sender == device.address or now - device.last >= _BOUND else None
-        if len(self._devices) >= self.most_devices and not self._evict(now):
+            silent = now - device.last
+            free = silent >= _BOUND or self._gives_way(name, lasted, silent)
+            return device if sender == device.address or free else None
+        if len(self._devices) >= self.most_devices and not self._evict(lasted, now):
             most = f"{self.most_devices} devices send, and no more are taken"
             self._dropping.tell(f"{most}; --device NAME takes the named ones alone", now, sender)
             return None
@@ -228,15 +234,32 @@ class Intake:
         self._devices[name] = _Device(stream, ClockCheck(self.ticks), sender, now)
         return self._devices[name]
 
-    def _evict(self, now: float) -> bool:
-        """Forget the device that has been silent longest; return whether there was one."""
-        name = min(self._devices, key=lambda one: self._devices[one].last)
-        if now - self._devices[name].last < _IDLE:
+    def _evict(self, lasted: float, now: float) -> bool:
+        """Forget a device in whose place one can be taken that has sent for ``lasted`` seconds;
+        return whether there is one.
+
+        One packet gives no place. Of the devices that are overdue, the one goes that has sent for
+        the shortest time, if that is shorter, or if it is silent for 2 s.
+        """
+        for name in sorted(self._devices, key=self._lasted):
+            silent = now - self._devices[name].last
+            if lasted and (silent >= _IDLE or self._gives_way(name, lasted, silent)):
+                break
+        else:
             return False
         device = self._devices.pop(name)
         self._put(device.stream.flush())
         self._counts.update(_beside_received(device))
         return True
+
+    def _gives_way(self, name: str, lasted: float, silent: float) -> bool:
+        """Return whether a device that has been ``silent`` for so many seconds gives way to who has
+        sent for ``lasted`` seconds: it is overdue, and has sent for a shorter time."""
+        return lasted > self._lasted(name) and self._senders.overdue(silent)
+
+    def _lasted(self, name: str) -> float:
+        """Return for how long a device has sent, seconds."""
+        return self._senders.lasted(name, self._devices[name].address)
 
     def discard(self) -> None:
         """Drop the frames that wait to be fetched."""
@@ -270,8 +293,8 @@ class Receiver(Intake, asyncio.DatagramProtocol):
 
     No content of a datagram stops the receiver or grows its memory: invalid datagrams are counted
     and discarded; the numbers of devices and of waiting frames are limited. A full queue discards
-    its oldest frame. At the limit of devices a new one takes the place of the one that has been
-    silent longest, 2 s at least.
+    its oldest frame. At the limit of devices a new one takes the place of one that is overdue and
+    has sent for a shorter time, or has been silent for 2 s.
 
     Args:
         layout: the array; its rate determines which packets are missing.

@@ -47,6 +47,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """
     parts: dict[str, list[pytest.Item]] = {
         "fitted": [],
+        "fitted_few": [],
         "made_bundle": [],
         "versions": [],
         "graph": [],
@@ -59,8 +60,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         if not costly and shares_with_its_module(item):
             costly = "of a module"
         parts[costly].append(item)
-    fitted, bundle, versions, graph, of_module, others = parts.values()
-    first = [*fitted, *of_module]
+    fitted, few, bundle, versions, graph, of_module, others = parts.values()
+    first = [*fitted, *few, *of_module]
     rest = max(0, len(items) // 2 - len(first))
     items[:] = [*first, *others[:rest], *bundle, *versions, *graph, *others[rest:]]
 
@@ -117,6 +118,18 @@ def fitted(grasps: Recordings, made_once) -> SelfDiagnosis:
             SelfDiagnosis(grasps.layout).fit(grasps.frames[::2]).save(folder / "fitted.npz")
 
     return SelfDiagnosis.load(made_once("fitted", make) / "fitted.npz")
+
+
+@pytest.fixture(scope="session")
+def few_cells() -> Recordings:
+    """140 simulated grasps of the small array, 100 frames each: a diagnosis of it costs a third."""
+    return simulate(20, SIMULATED, seed=3)
+
+
+@pytest.fixture(scope="session")
+def fitted_few(few_cells: Recordings) -> SelfDiagnosis:
+    """Fitted to every other of the grasps of the small array."""
+    return SelfDiagnosis(SIMULATED).fit(few_cells.frames[::2])
 
 
 @pytest.fixture(scope="session")
@@ -368,7 +381,7 @@ def whole_fit() -> AbstractContextManager[None]:
 def rough_fits() -> Iterator[None]:
     """Let a fit take fewer steps and judge fewer logs, which take most of its time; see
     ``wholly_fitted``."""
-    with fit_of(200, 8):
+    with fit_of(100, 4):
         yield
 
 

@@ -59,6 +59,15 @@ class Measured:
         """The figures without counts."""
         return {(figure["array"], figure["row"]): figure["value"] for figure in self.figures}
 
+    @cached_property
+    def since(self) -> dict[Key, float]:
+        """Those of the one model."""
+        return {
+            (figure["array"], figure["row"]): figure["value"]
+            for figure in self.figures
+            if not figure["before"]
+        }
+
     def value(self, array: str, row: str, split: int | None = None) -> float | None:
         """Return a figure, of all splits or of one; None where it was not measured."""
         if split is None and (array, row) in self.newer:
@@ -155,7 +164,7 @@ OF_HAND = (  # what the page says, row of the table, --rows
 def hand(measured: Measured) -> Table:
     """The hand, a column a split, and one of what was measured since."""
     splits = measured.splits("hand")
-    since = [measured.newer.get(("hand", row)) for _, row, _ in OF_HAND]
+    since = [measured.since.get(("hand", row)) for _, row, _ in OF_HAND]
     head = ["", *(f"split {split}" for split in splits), *(["since, split 0"] * any(since)), "ROW"]
     table: Table = [head]
     for (name, row, rows), now in zip(OF_HAND, since, strict=True):
@@ -258,11 +267,7 @@ def by_array(
     """
     rows = list(rows)
     of_rows = {row for _, row in rows}
-    since = {
-        figure["array"]
-        for figure in measured.figures
-        if figure["row"] in of_rows and not figure["before"]
-    }
+    since = {array for array, row in measured.since if row in of_rows}
     columns: list[list[str]] = [["", *(name for name, _ in rows)]]
     for name in LIFE:
         array = f"{name}, {kind}"

@@ -170,7 +170,8 @@ def hand(measured: Measured) -> Table:
     for (name, row, rows), now in zip(OF_HAND, since, strict=True):
         figures = [shown(measured.value("hand", row, split)) for split in splits]
         figures += [shown(now)] * any(since)
-        table.append([name, *figures, f"`{rows}`"])
+        if set(figures) != {ABSENT}:
+            table.append([name, *figures, f"`{rows}`"])
     return table
 
 

@@ -216,7 +216,7 @@ def test_a_figure_without_counts_is_deleted_once_it_is_measured(monkeypatch):
     assert measured.left() == figures[1:]
     table = pages.drawn(pages.hand(measured)).splitlines()
     assert table[0] == "|  | split 0 | since, split 0 | ROW |"
-    assert table[3] == "| recall | 0.250 | 0.500 | `cells` |"
+    assert table[2] == "| recall | 0.250 | 0.500 | `cells` |"
     assert pages.drawn(pages.hand(pages.Measured([count], []))).count("since") == 0
 
 

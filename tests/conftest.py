@@ -47,7 +47,6 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """
     parts: dict[str, list[pytest.Item]] = {
         "fitted": [],
-        "fitted_few": [],
         "made_bundle": [],
         "versions": [],
         "graph": [],
@@ -60,8 +59,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         if not costly and shares_with_its_module(item):
             costly = "of a module"
         parts[costly].append(item)
-    fitted, few, bundle, versions, graph, of_module, others = parts.values()
-    first = [*fitted, *few, *of_module]
+    fitted, bundle, versions, graph, of_module, others = parts.values()
+    first = [*fitted, *of_module]
     rest = max(0, len(items) // 2 - len(first))
     items[:] = [*first, *others[:rest], *bundle, *versions, *graph, *others[rest:]]
 

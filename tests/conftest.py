@@ -120,6 +120,18 @@ def fitted(grasps: Recordings, made_once) -> SelfDiagnosis:
 
 
 @pytest.fixture(scope="session")
+def few_cells() -> Recordings:
+    """140 simulated grasps of the small array, 100 frames each: a diagnosis of it costs a third."""
+    return simulate(20, SIMULATED, seed=3)
+
+
+@pytest.fixture(scope="session")
+def fitted_few(few_cells: Recordings) -> SelfDiagnosis:
+    """Fitted to every other of the grasps of the small array."""
+    return SelfDiagnosis(SIMULATED).fit(few_cells.frames[::2])
+
+
+@pytest.fixture(scope="session")
 def pressed(made_once) -> SelfDiagnosis:
     """Fitted with all steps to 80 recordings of presses; see pressed_recordings.py."""
     from pressed_recordings import LAYOUT, presses
@@ -368,7 +380,7 @@ def whole_fit() -> AbstractContextManager[None]:
 def rough_fits() -> Iterator[None]:
     """Let a fit take fewer steps and judge fewer logs, which take most of its time; see
     ``wholly_fitted``."""
-    with fit_of(200, 8):
+    with fit_of(100, 4):
         yield
 
 

@@ -374,8 +374,8 @@ class _Test:
         loaded = np.abs(loads) > self._usual.least
         if loaded[jumped].mean() < MAJORITY:  # they fell to their rest
             return False
-        agreement, chance = _agreement(loads, on & (jumped | loaded), self._beside)
-        return bool(agreement < self._least(on) and chance > P_MIN)
+        agreement, count = _agreement(loads, on & (jumped | loaded), self._beside)
+        return agreement < self._least(on) and chance_of(agreement, count) > P_MIN
 
     @cached_property
     def _beside(self) -> NDArray[np.intp]:
@@ -401,7 +401,7 @@ class _Test:
         some = np.flatnonzero(loaded.sum(axis=1) >= _ENOUGH)
         some = some[:: max(1, len(some) // _SAMPLE)].tolist()
         of_frames = [_agreement(loads[t], loaded[t], beside) for t in some]
-        return [agreement for agreement, chance in of_frames if chance < 1] or [0.0]
+        return [one for one, count in of_frames if chance_of(one, count) < 1] or [0.0]
 
 
 def evenly(
@@ -430,15 +430,42 @@ def _followers(sample: Floats) -> NDArray[np.intp]:
     return np.where(moves, correlation.argmax(axis=1), -1)
 
 
-def _agreement(loads: Floats, loaded: Mask, beside: NDArray[np.intp]) -> tuple[float, float]:
+def _agreement(loads: Floats, loaded: Mask, beside: NDArray[np.intp]) -> tuple[float, int]:
     """Return the rank correlation of the loads ``[D]`` of some cells with the mean of their
-    neighbours', and how likely it is by chance; 1 and 1 where that cannot be measured."""
-    from scipy.stats import spearmanr  # slow to import, and rarely needed
-
+    neighbours', and of how many cells it is; 1 and 0 where that cannot be measured."""
     known = beside >= 0
     around = np.where(known, loads[beside], 0.0).sum(axis=1) / np.maximum(known.sum(axis=1), 1)
     both = loaded & known.any(axis=1)
-    if both.sum() < _ENOUGH or not np.ptp(around[both]) or not np.ptp(loads[both]):
-        return 1.0, 1.0
-    result = spearmanr(loads[both], around[both], alternative="greater")
-    return float(result.statistic), float(result.pvalue)
+    count = int(both.sum())
+    if count < _ENOUGH or not np.ptp(around[both]) or not np.ptp(loads[both]):
+        return 1.0, 0
+    return rank_correlation(loads[both], around[both]), count
+
+
+def rank_correlation(first: Floats, second: Floats) -> float:
+    """Return Spearman's rank correlation of two rows ``[n]``, neither of which is constant; as
+    :func:`scipy.stats.spearmanr`, in a fifth of its time on a few cells."""
+    one = _centred_ranks(first)
+    other = _centred_ranks(second)
+    correlation = one @ other / np.sqrt((one @ one) * (other @ other))
+    return float(np.clip(correlation, -1.0, 1.0))
+
+
+def _centred_ranks(values: Floats) -> Floats:
+    """Return the ranks of values ``[n]``, equal ones at their mean, around 0."""
+    _, place, times = np.unique(values, return_inverse=True, return_counts=True)
+    ranks = np.cumsum(times) - (times - 1) / 2
+    return ranks[place] - (len(values) + 1) / 2
+
+
+def chance_of(correlation: float, count: int) -> float:
+    """Return how likely so high a rank correlation of so many independent pairs is."""
+    if count == 0 or correlation <= -1:
+        return 1.0
+    if correlation >= 1:
+        return 0.0
+    from scipy.special import stdtr  # slow to import, and rarely needed
+
+    freedom = count - 2
+    against = correlation * np.sqrt(freedom / ((1 + correlation) * (1 - correlation)))
+    return float(stdtr(freedom, -against))

@@ -85,6 +85,7 @@ def test_cells_that_hold_the_loads_of_an_object_without_their_noise_are_stuck(
 
 
 @pytest.mark.usefixtures("seldom_evaluated")
+@pytest.mark.usefixtures("seldom_evaluated")
 def test_a_monitor_tells_of_the_same_object(fitted, log, object_):
     frames = np.concatenate(lying(log[:12], object_))
     monitor = Monitor(fitted, wait=True)

@@ -250,7 +250,7 @@ def test_its_level_follows_from_the_loads_of_the_intact_lines(grasps, fitted):
     for level in (0, 1):
         for line in bits:
             log = np.concatenate(
-                [grasps.frames[i] for i in rng.choice(np.arange(1, 140, 2), 6, replace=False)]
+                [grasps.frames[i] for i in rng.choice(np.arange(1, 140, 2), 4, replace=False)]
             )
             fault = line_fault(grasps.layout, line, FaultKind.ALIAS, value=level)
             told = fitted.diagnose(inject(log, [fault], grasps.layout)).faults

@@ -146,10 +146,10 @@ def test_what_nothing_is_known_of_is_not_judged(model, healthy):
 
 
 def test_the_same_recordings_give_the_same_model(healthy):
-    once, again = [fit_model(presses(0, 80), LAYOUT, np.zeros(64, bool)) for _ in range(2)]
-    record = once.record_of(healthy)
+    one, again = [fit_model(presses(0, 48), LAYOUT, np.zeros(64, bool)) for _ in range(2)]
+    record = one.record_of(healthy)
     np.testing.assert_allclose(
-        again.judge_record(record).probability, once.judge_record(record).probability, rtol=1e-4
+        again.judge_record(record).probability, one.judge_record(record).probability, rtol=1e-4
     )
 
 

@@ -189,6 +189,37 @@ def test_benchmark_rows_and_arrays_that_the_results_name_exist():
     assert [skin for skin in skins if f'"{skin}"' not in sources + arrays] == []
 
 
+def test_the_tables_of_the_result_pages_are_what_was_measured(monkeypatch):
+    monkeypatch.syspath_prepend(HOME / "benchmarks")
+    import pages
+
+    measured = pages.Measured.read()
+    texts = [page.read_text() for page in sorted(pages.PAGES.glob("results*.md"))]
+    named = pages.BLOCK.findall("".join(texts))
+    assert sorted(named) == sorted(pages.TABLES)
+    for text in texts:
+        assert pages.written(text, measured) == text
+
+
+def test_a_figure_without_counts_is_deleted_once_it_is_measured(monkeypatch):
+    monkeypatch.syspath_prepend(HOME / "benchmarks")
+    import pages
+
+    count = {"array": "hand", "split": 0, "repeat": 0, "logs": 9, "row": "16 % dead: recall"}
+    count |= {"part": 1, "of": 4, "unit": "", "higher": True}
+    figures = [
+        {"array": "hand", "row": row, "value": 0.5, "before": False, "from": "a run"}
+        for row in ("16 % dead: recall", "40 % dead: recall")
+    ]
+    measured = pages.Measured([count], figures)
+    assert measured.value("hand", "16 % dead: recall") == 0.5
+    assert measured.left() == figures[1:]
+    table = pages.drawn(pages.hand(measured)).splitlines()
+    assert table[0] == "|  | split 0 | since, split 0 | ROW |"
+    assert table[2] == "| recall | 0.250 | 0.500 | `cells` |"
+    assert pages.drawn(pages.hand(pages.Measured([count], []))).count("since") == 0
+
+
 def test_the_page_of_formats_names_every_key_and_field_that_is_read(tmp_path):
     page = HOME / "docs" / "file-formats.md"
     layout_fields = {f.name for f in fields(SensorLayout)} | {"schema"}

@@ -200,7 +200,7 @@ def tried(diagnosis: Diagnosis, layout: SensorLayout) -> None:
 
 @on_every_kind(2)
 def test_every_call_of_the_diagnosis_ends_well_with_a_reference_and_without(layout: SensorLayout):
-    later = touched(layout, 2)[: RECORDINGS // 2]
+    later = touched(layout, 2)[: RECORDINGS // 4]
     broken = [inject(frames, some_faults(layout, 3), layout, seed=4) for frames in later]
     cold = SelfDiagnosis(layout)
     fitted = fitted_on(layout)

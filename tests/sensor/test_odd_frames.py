@@ -7,7 +7,12 @@ from hypothesis import strategies as st
 
 import adaptfault as af
 from diagnostics import SelfDiagnosis, SensorLayout
-from diagnostics.sensor.odd_frames import find_odd_frames, without_odd_frames
+from diagnostics.sensor.odd_frames import (
+    chance_of,
+    find_odd_frames,
+    rank_correlation,
+    without_odd_frames,
+)
 
 LAYOUT = SensorLayout(2, 7, 6, full_scale=1023.0, unit="count", rate=20.0)
 D = LAYOUT.n_cells
@@ -125,3 +130,17 @@ def test_diagnosis_and_inspection_name_a_corrupt_frame_and_judge_as_without_it(l
     assert [finding.name for finding in inspected.findings][:1] == ["corrupt_frame"]
     np.testing.assert_array_equal(found.verdicts, plain.verdicts)
     np.testing.assert_array_equal(inspected.diagnosis.verdicts, plain.verdicts)
+
+
+@pytest.mark.parametrize("count", [3, 10, 36, 150])
+def test_ranks_correlate_as_those_of_scipy(count, rng):
+    from scipy.stats import spearmanr
+
+    for strength in (-5.0, 0.0, 0.5, 5.0):
+        first = rng.normal(size=count).round(1)  # some are equal
+        second = (strength * first + rng.normal(size=count)).round(1)
+        expected = spearmanr(first, second, alternative="greater")
+        correlation = rank_correlation(first, second)
+        assert correlation == pytest.approx(expected.statistic, abs=1e-12)
+        assert chance_of(correlation, count) == pytest.approx(expected.pvalue, abs=1e-12)
+    assert chance_of(1.0, 0) == 1

@@ -284,7 +284,7 @@ class Observed:
     def stays(self) -> Mask:
         """Where a cell stays while the load that known cells of its pad report stays, bool
         ``[n, D]``: so does a healthy one, but not below its rest, nor at the top while no other
-        is loaded: no load that stays holds it there."""
+        is loaded, nor beyond what the reference shows: no load that stays holds it there."""
         log = self.log
         load = np.where(self.known, log.load, 0).astype(np.float32)
         of_pad = self.predictor.on_pad(load)
@@ -295,9 +295,11 @@ class Observed:
         nobody_moves = self.predictor.on_pad((self.known & ~dithers).astype(np.float32)) == 0
         of_others = _same(of_pad) | nobody_moves
         stays = of_others & (_same(log.load) | dithers) & ~log.record.first[:, None]
-        alone = of_pad - load <= NOTHING
-        top = log.symbols.top
-        found: Mask = stays & ((log.level < top) | ((log.level == top) & ~alone))
+        symbols = log.symbols
+        beside_others = of_pad - load > NOTHING
+        usual = log.record.mean <= symbols.rest.full + symbols.tolerance
+        at_top = (log.level == symbols.top) & usual & beside_others
+        found: Mask = stays & ((log.level < symbols.top) | at_top)
         return found
 
     def delayed(self, lag: int) -> Array:

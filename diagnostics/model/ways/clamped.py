@@ -26,9 +26,11 @@ def _limit(observed: Observed) -> Array:
 
 
 def _again(log: Log, at: Mask) -> Array:
-    """Return the log ratio ``[n, D]`` of recordings that reach the limit as an earlier one did;
+    """Return the log ratio ``[n, D]`` of recordings that stay at the limit as an earlier one did;
     ``at``: bool ``[n, D]``, where readings are at it. The peaks of a healthy cell agree by chance.
     """
+    at_before = np.roll(at, 1, axis=0) & ~log.record.first[:, None]
+    at = at & at_before
     count = np.cumsum(at, axis=0)
     begins = np.maximum.accumulate(np.where(log.record.first, np.arange(len(at)), 0))
     before: Cells = (count - at)[begins]
@@ -41,8 +43,9 @@ def _evidence(observed: Observed, units: Units) -> Array:
     log = observed.log
     symbols = log.symbols
     limit = _limit(observed)
-    at = (log.record.high >= limit - log.finest) & (log.level > 0)
-    at &= limit < symbols.rest.high - symbols.tolerance
+    below = limit - log.record.high
+    possible = (log.level > 0) & (limit < symbols.rest.high - symbols.tolerance)
+    at = (below <= symbols.rest.full * 1e-5) & possible
     loads = observed.levels[..., : symbols.top + 1]
     at_least = np.flip(np.cumsum(np.flip(loads, -1), -1), -1)
     at_least = np.pad(at_least, ((0, 0), (0, 0), (0, _NEAR)))
@@ -50,7 +53,7 @@ def _evidence(observed: Observed, units: Units) -> Array:
     more = np.take_along_axis(at_least, level, 2)[..., 0]
     much_more = np.take_along_axis(at_least, level + _NEAR, 2)[..., 0]
     near = np.log(np.maximum(more - much_more, np.exp(observed.of_level)))
-    ratio = np.where(at, np.log(more) - near, 0) + _again(log, at)
+    ratio = np.where(at, np.log(more) - near, 0) + _again(log, (below <= log.finest) & possible)
     still = ratio + np.where(at & (log.flat != MOVES), -observed.of_flatness, 0)
     # a healthy cell is still now and then, where it reads most
     moves_by_itself = no_more_than_floats(

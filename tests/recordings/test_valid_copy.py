@@ -283,6 +283,16 @@ def test_of_other_formats_the_masks_stand_beside_the_arrays(ending, tmp_path):
         np.testing.assert_array_equal(old, new)
 
 
+def test_a_copy_that_would_fill_the_disk_is_not_begun(tmp_path, monkeypatch):
+    source = demos(tmp_path / "set.h5")
+    before = files(tmp_path)
+    usage = shutil.disk_usage(tmp_path)._replace(free=1000)
+    monkeypatch.setattr(shutil, "disk_usage", lambda path: usage)
+    with pytest.raises(OSError, match="No space left on device"):
+        copied(source, tmp_path / "copy.h5")
+    assert files(tmp_path) == before
+
+
 def test_episodes_one_behind_the_other_have_one_mask(tmp_path):
     root = zarr.open_group(tmp_path / "set.zarr", mode="w", zarr_format=2)
     root.create_array("data/tactile", data=readings()[:, 0])

@@ -20,6 +20,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from io import BytesIO
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -257,7 +258,9 @@ def _zarr(path: Path, masks: Masks, names: Sequence[str], places: Places) -> Non
 
 def _hdf5(path: Path, masks: Masks, names: Sequence[str], places: Places) -> None:
     h5py = imported("h5py", path)
-    with atomic_file(path) as place, h5py.File(place, "w") as file:
+    # in memory: HDF5 does not survive a disk that fills
+    written = BytesIO()
+    with h5py.File(written, "w") as file:
         for i, (mask, name) in enumerate(zip(masks, names, strict=True)):
             if places.are_own:
                 for array, part in zip(places.arrays[i], places.parts(i, mask), strict=True):
@@ -271,6 +274,8 @@ def _hdf5(path: Path, masks: Masks, names: Sequence[str], places: Places) -> Non
                 continue
             for array, part in zip(places.arrays[i], places.parts(i, mask), strict=True):
                 group.create_dataset(f"{array}{VALID}", data=part, compression="gzip")
+    with atomic_file(path) as place:
+        place.write_bytes(written.getbuffer())
 
 
 _WRITERS: Mapping[str, Callable[[Path, Masks, Sequence[str], Places], None]] = {

@@ -14,6 +14,8 @@ they are.
 
 from __future__ import annotations
 
+import errno
+import os
 import shutil
 from collections.abc import Callable, Mapping, Sequence
 from os import PathLike
@@ -33,6 +35,7 @@ from adaptfault.data.recordings.recording import Recording
 from adaptfault.data.recordings.valid import Masks, Places
 from diagnostics import SensorLayout
 
+_OF_DATASET = 1 << 16  # bytes of a new array beside its readings
 _FORMS = "a LeRobot data set, a Parquet or HDF5 file, or a Zarr store"
 
 Writer = Callable[[Path, Path, Masks, Places], None]
@@ -99,8 +102,17 @@ def _hdf5(path: Path, source: Path, masks: Masks, places: Places) -> None:
     with atomic_file(path) as place:
         shutil.copyfile(source, place)
         with h5py.File(place, "r+") as file:
-            for name, mask in _by_array(masks, places, source, file).items():
+            by_array = _by_array(masks, places, source, file)
+            _require_room(place, by_array)
+            for name, mask in by_array.items():
                 file.create_dataset(f"{name}{VALID}", data=mask, compression="gzip")
+
+
+def _require_room(place: Path, masks: Mapping[str, NDArray[np.bool_]]) -> None:
+    """Raise OSError where a disk has no room for masks: HDF5 does not survive that it fills."""
+    needed = sum(mask.nbytes + _OF_DATASET for mask in masks.values())
+    if shutil.disk_usage(place.parent).free < needed:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(place))
 
 
 def _zarr(path: Path, source: Path, masks: Masks, places: Places) -> None:

@@ -178,7 +178,8 @@ class Rest:
             if lowest.shape[1] > _FEWEST:
                 of_lowest, sunk, evenly = even(lowest, noise / 2, noise / 2)
                 enough = lowest.shape[1] >= 2 * _FEWEST
-                sure = np.where(of_lowest < 0, sunk, evenly * enough)
+                raised = evenly * (enough & (beside == 0))
+                sure = np.where(of_lowest < 0, sunk, raised)
                 beside = np.where(sure > 0, sure * of_lowest, beside)
             shared = weight * middle + (1 - weight) * beside
             if self.pressed[cells].any():

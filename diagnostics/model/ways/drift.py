@@ -57,4 +57,4 @@ def _since(observed: Observed, units: Units) -> Cells:
     return since(_ratio(observed), units)
 
 
-DRIFTS = Way(FaultKind.DRIFT, 0.05, _evidence, _since, decides=False, floats=True)
+DRIFTS = Way(FaultKind.DRIFT, 0.03, _evidence, _since, decides=False, floats=True)

@@ -44,4 +44,4 @@ def _most_before(high: Array, first: Mask) -> Array:
     return found
 
 
-KEEPS = Way(FaultKind.DRIFT, 0.05, _evidence, decides=False)
+KEEPS = Way(FaultKind.DRIFT, 0.02, _evidence, decides=False)

@@ -27,6 +27,8 @@ _OF_ANY_SENSOR = (
     FaultKind.COPY,
 )
 
+_OF_GAIN = (FaultKind.WEAK, FaultKind.DRIFT, FaultKind.INTERMITTENT)
+
 FEWEST = 12
 """Recordings of a log, in whose halves a change is found again."""
 
@@ -193,8 +195,12 @@ def _without_offsets(
 
 
 def _of_this_sensor(diagnosis: Diagnosis) -> bool:
-    """Return whether a fault is told by how much cells of this sensor should read."""
-    return any(fault.kind not in _OF_ANY_SENSOR for fault in diagnosis.faults)
+    """Return whether a fault is told by how much cells of this sensor should read. One cell that
+    moves by itself is rather a fault than another sensor, and so are those that come late."""
+    if any(fault.kind in _OF_GAIN for fault in diagnosis.faults):
+        return True
+    others = (*_OF_ANY_SENSOR, FaultKind.LATE)
+    return sum(len(fault.cells) for fault in diagnosis.faults if fault.kind not in others) > 1
 
 
 def _left(diagnosis: Diagnosis) -> Diagnosis:

@@ -1,10 +1,13 @@
 """Recordings of two sensors in one log are told apart, and no healthy cell is blamed."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 import adaptfault as af
-from diagnostics import Fault, SelfDiagnosis, SensorLayout, inject
+from adaptfault.inspection import find_changes
+from diagnostics import Diagnosis, Fault, SelfDiagnosis, SensorLayout, inject
 from diagnostics.sensor.other_gains import outliers_of_others
 
 LAYOUT = SensorLayout(1, 6, 6, full_scale=1023.0, unit="count", rate=20.0)
@@ -239,3 +242,14 @@ def test_a_cell_stands_out_by_what_cells_of_the_log_differ():
     ratio, precision = log_ratios(3, 0.0)
     assert others(ratio[:34], precision[:34]) is None  # too few recordings
     assert others(ratio, precision * 0) is None
+
+
+@pytest.mark.parametrize(
+    ("kinds", "asks"),
+    [(["late", "late"], False), (["floating"], False), (["floating"] * 2, True), (["weak"], True)],
+)
+def test_a_cell_that_moves_by_itself_or_late_asks_for_no_other_sensor(kinds, asks):
+    layout = SensorLayout(1, 4, 4)
+    faults = tuple(Fault(kind, (cell,), probability=1.0) for cell, kind in enumerate(kinds))
+    diagnosis = replace(Diagnosis.untold(layout, [60]), faults=faults)
+    assert find_changes._of_this_sensor(diagnosis) is asks

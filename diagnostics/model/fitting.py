@@ -395,14 +395,15 @@ class _Reached:
 
     def bound(self, model: Model) -> None:
         """Let a model know it: of each cell, and what one of ten logs exceeds of all; and of which
-        ways hardly any healthy cell looks."""
+        ways hardly any healthy cell is certain."""
         highest = self.highest.copy()
         cells = int(model.living.sum())
         for of_length, logs in zip(highest, self.every, strict=True):
             if logs:
-                tail = np.quantile(np.concatenate(logs, axis=1), 1 - _EXCEED / cells, axis=1)
+                evidence = np.concatenate(logs, axis=1)
+                tail = np.quantile(evidence, 1 - _EXCEED / cells, axis=1)
                 np.maximum(of_length, tail[:, None], out=of_length)
-                usually = np.quantile(np.concatenate(logs, axis=1), _USUALLY, axis=1)
+                usually = np.quantile(evidence, _USUALLY, axis=1)
                 model.telling &= usually < CERTAIN
         model.highest = np.maximum.accumulate(highest)
         model.reached = np.maximum.accumulate(self.units)

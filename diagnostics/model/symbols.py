@@ -19,7 +19,7 @@ HOLDS = 0.6  # dithers: readings this close to a value hold it
 CONSTANT, DITHERS, MOVES, BEGINS = range(4)  # how flat; before the first piece of a recording
 AT_REST, LOADED, AT_TOP, BELOW = range(4)  # groups of levels
 _LEVELS = 10
-_SAME = 1e-5  # of full scale: readings this close are the same
+SAME = 1e-5  # of full scale: readings this close are the same
 _CELLS = 30.0  # pieces of all cells that weigh on the table of one
 _ANY = 0.01  # of a uniform distribution in any table: tables err
 _ACTIVE = (0.01, 0.3, 0.7)  # shares of the loaded cells that move
@@ -90,7 +90,7 @@ class Symbols:
         """Return how flat each piece is, ``[n, D]``."""
         ranges = record.high - record.low
         moves = (ranges > DITHER * self.rest.full).astype(np.int8)
-        return moves + (ranges > _SAME * self.rest.full)
+        return moves + (ranges > SAME * self.rest.full)
 
     def group(self, level: NDArray[np.integer]) -> Cells:
         """Return the group of each level."""

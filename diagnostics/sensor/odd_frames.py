@@ -28,6 +28,7 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import stdtr
 
 from diagnostics.layout import SensorLayout
 from diagnostics.preprocessing.levels import LEAST_LOADED, LIGHT, LOW, MAJORITY, P_MIN
@@ -464,8 +465,6 @@ def chance_of(correlation: float, count: int) -> float:
         return 1.0
     if correlation >= 1:
         return 0.0
-    from scipy.special import stdtr  # slow to import, and rarely needed
-
     freedom = count - 2
     against = correlation * np.sqrt(freedom / ((1 + correlation) * (1 - correlation)))
     return float(stdtr(freedom, -against))

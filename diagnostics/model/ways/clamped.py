@@ -12,8 +12,8 @@ import numpy as np
 from diagnostics.faults import FaultKind
 from diagnostics.model.observed import Log, Observed
 from diagnostics.model.over_time import Units, throughout
-from diagnostics.model.record import Array, Cells, Mask
-from diagnostics.model.symbols import MOVES
+from diagnostics.model.record import Array, Cells, Mask, since_begin
+from diagnostics.model.symbols import MOVES, SAME
 from diagnostics.model.ways.floats import no_more_than_floats
 from diagnostics.model.ways.way import Way
 
@@ -32,7 +32,7 @@ def _again(log: Log, at: Mask) -> Array:
     at_before = np.roll(at, 1, axis=0) & ~log.record.first[:, None]
     at = at & at_before
     count = np.cumsum(at, axis=0)
-    begins = np.maximum.accumulate(np.where(log.record.first, np.arange(len(at)), 0))
+    begins = np.arange(len(at)) - since_begin(log.record.first)
     before: Cells = (count - at)[begins]
     again = at & (count == before + 1) & (before > 0)
     found: Array = np.where(again, -log.same_by_chance, 0)
@@ -45,7 +45,7 @@ def _evidence(observed: Observed, units: Units) -> Array:
     limit = _limit(observed)
     below = limit - log.record.high
     possible = (log.level > 0) & (limit < symbols.rest.high - symbols.tolerance)
-    at = (below <= symbols.rest.full * 1e-5) & possible
+    at = (below <= SAME * symbols.rest.full) & possible
     loads = observed.levels[..., : symbols.top + 1]
     at_least = np.flip(np.cumsum(np.flip(loads, -1), -1), -1)
     at_least = np.pad(at_least, ((0, 0), (0, 0), (0, _NEAR)))

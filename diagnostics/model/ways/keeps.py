@@ -1,7 +1,7 @@
 """Keeps its highest load until the recording ends: a cover that sticks, a charge that stays.
 
 The mirror of a limit: a piece that reads what the cell read most before counts as any load up to
-that one, and two readings of a healthy cell are the same by chance. A reading below it denies it.
+that one, and is as flat as a healthy cell rarely is. A reading below it denies it.
 
 Not detected: one whose contacts all last to the end of their recordings; one at the end of the
 range.

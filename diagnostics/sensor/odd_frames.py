@@ -28,7 +28,6 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import stdtr
 
 from diagnostics.layout import SensorLayout
 from diagnostics.preprocessing.levels import LEAST_LOADED, LIGHT, LOW, MAJORITY, P_MIN
@@ -461,6 +460,8 @@ def _centred_ranks(values: Floats) -> Floats:
 
 def chance_of(correlation: float, count: int) -> float:
     """Return how likely so high a rank correlation of so many independent pairs is."""
+    from scipy.special import stdtr  # a check of a data set rarely needs it, and waits for it
+
     if count == 0 or correlation <= -1:
         return 1.0
     if correlation >= 1:

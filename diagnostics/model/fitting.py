@@ -65,6 +65,7 @@ _SHORT = 6  # of a short one
 _DEAD = (0.0, 0.04, 0.08, 0.16)  # shares of the cells that are dead in it
 _EXCEED = 0.1  # healthy cells of a log exceed the limit of all
 _USUALLY = 0.95  # of the healthy cells
+_OBJECT = 2  # cells from its middle to its edge
 
 Recordings = Sequence[NDArray[np.floating]]
 Examples = tuple[Array, NDArray[np.int8]]
@@ -410,15 +411,26 @@ class _Reached:
 
 
 def _of_healthy_lines(model: Model, judgement: Judgement, rng: np.random.Generator) -> Array:
-    """Return the evidence of each line ``[W]`` in a log without broken ones, and with a line beside
-    it that is left out."""
+    """Return the evidence of each line ``[W]`` in a log without broken ones, with a line beside it
+    that is left out, and with cells that an object lies on."""
     observed = judgement.observed
     moving = model.moving(observed.log)
     found = np.zeros(len(model.lines.on), np.float32)
     if len(found):
         out = model.lines.on[rng.integers(len(found))]
-        for free in (np.ones_like(out), ~out):
+        under = _around(model, int(rng.choice(np.flatnonzero(model.living))))
+        for free in (np.ones_like(out), ~out, ~under):
             known = observed.known & free
             evidence = model.lines.evidence(observed, known, moving & free)
             found = np.maximum(found, evidence[0])
+    return found
+
+
+def _around(model: Model, cell: int) -> Mask:
+    """Return a cell and those around it, as many as an object loads, bool ``[D]``."""
+    found = np.zeros(len(model.present), bool)
+    found[cell] = True
+    for _ in range(_OBJECT):
+        beside = model.predictor.beside[found]
+        found[beside[beside >= 0]] = True
     return found

@@ -47,7 +47,7 @@ def _narrow(width: Array, limit: Array | float) -> Array:
 
 def around(shared: Array, sure: Mask, record: Record) -> Array:
     """Return what a pad ``shared`` (``[n]``) before or after each piece in its recording, where it
-    is ``sure`` (bool ``[n]``), whichever is less; 0: nowhere."""
+    is ``sure`` (bool ``[n]``), whichever is less; NaN: nowhere."""
     n = len(shared)
     step = np.arange(n)
     begin = step - since_begin(record.first)
@@ -56,8 +56,31 @@ def around(shared: Array, sure: Mask, record: Record) -> Array:
     end = _next(np.append(record.first[1:], True))
     coming = _next(sure)
     after = np.where(coming <= end, shared[np.minimum(coming, n - 1)], np.inf)
-    less = np.where(np.abs(before) <= np.abs(after), before, after)
-    found: Array = np.where(np.isinf(less), 0, less)
+    less = _less(before, after)
+    found: Array = np.where(np.isinf(less), np.float32(np.nan), less)
+    return found
+
+
+def recordings_around(shared: Array, sure: Mask, record: Record) -> Array:
+    """Return the least of what a pad ``shared`` in the recording before or after that of each piece
+    in which it is ``sure``, ``[n]``; 0: in none."""
+    first = np.flatnonzero(record.first)
+    lowest = np.minimum.reduceat(np.where(sure, shared, np.inf), first)
+    highest = np.maximum.reduceat(np.where(sure, shared, -np.inf), first)
+    tells = np.isfinite(lowest)
+    least = np.append(np.clip(0, lowest, highest), np.inf)  # the last one stands for none
+    number = np.arange(len(first))
+    before = least[np.maximum.accumulate(np.where(tells, number, -1))]
+    after = least[_next(tells)]
+    less = _less(before, after)
+    of_recording = np.where(np.isinf(less), 0, less)
+    found: Array = np.repeat(of_recording, np.diff(np.append(first, len(shared))))
+    return found
+
+
+def _less(one: Array, other: Array) -> Array:
+    """Return whichever is smaller in size."""
+    found: Array = np.where(np.abs(one) <= np.abs(other), one, other)
     return found
 
 

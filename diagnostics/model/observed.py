@@ -8,6 +8,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from diagnostics.model.middles import EVEN
 from diagnostics.model.predictor import Predictor
 from diagnostics.model.record import Array, Mask, Record
 from diagnostics.model.rest import DITHER
@@ -69,7 +70,10 @@ class Log:
         self.disturbed: Mask = shared.unseen | rest.noisier(noise)
         if self.is_coarse:
             self.disturbed = np.ones_like(self.disturbed)
-        self.above = np.where(wider & (np.abs(self.above) <= unsure), 0, self.above)
+        # a cell that stays about its rest rests, wherever that is by now
+        stays = np.fmax.reduce(record.mean) - np.fmin.reduce(record.mean) <= DITHER * rest.full
+        about = np.where(stays, DITHER * rest.full, np.where(wider, unsure, 0))
+        self.above = np.where(np.abs(self.above) <= about, 0, self.above)
         self.value = _held(record.mean, DITHER * rest.full)
         # beyond the range of the reference every reading is the top
         top = rest.full - symbols.tolerance
@@ -81,8 +85,10 @@ class Log:
         shifts = [np.zeros_like(doubt), -doubt, doubt]
         if wider.any():
             shifts += [-doubt / 2, doubt / 2]
+        # an offset that the reference never saw: a cell may share none of it, or sink by half
+        uneven = np.where(shared.unseen, (1 + EVEN) * np.maximum(shared.offset, 0), 0)
         self.either = np.stack(
-            [symbols.levels(record, self.above + shift, self.holds) for shift in shifts]
+            [symbols.levels(record, self.above + shift, self.holds, uneven) for shift in shifts]
         )
         self._alone: Array | None = None
 
@@ -163,8 +169,15 @@ class Log:
             levels = levels.copy()
             levels[..., top] = levels[..., 1 : top + 1].sum(axis=-1)
         chosen = self.either[:, lag:, :, None].astype(np.intp)
-        found: Array = np.log(np.take_along_axis(levels[None], chosen, 3)[..., 0].max(axis=0))
-        return found
+        found: Array = np.take_along_axis(levels[None], chosen, 3)[..., 0].max(axis=0)
+        if self.step:
+            # a step holds several levels; what is below rest by half of one is at rest
+            loads = np.where(chosen[3:] > self.symbols.top, 0, chosen[3:])
+            up_to = np.pad(np.cumsum(levels, -1), ((0, 0), (0, 0), (1, 0)))
+            least = np.take_along_axis(up_to, loads.min(axis=0), 2)
+            most = np.take_along_axis(up_to, loads.max(axis=0) + 1, 2)
+            found = np.maximum(found, (most - least)[..., 0])
+        return np.log(found)
 
 
 def _held(mean: Array, dither: float) -> Array:
@@ -259,8 +272,8 @@ class Observed:
 
     def constancy(self, *, dithers: bool) -> Array:
         """Return the log ratio ``[n, D]`` of how flat a piece is, given the one before, where a
-        cell holds its value: nothing where no known cell moves, at rest where steps are coarser,
-        or at a top that any load reaches."""
+        cell holds its value: nothing where no known cell moves, at rest where steps are coarser, or
+        where a disturbed pad dithers there, or at a top that any load reaches."""
         log = self.log
         moves = ((log.flat == MOVES) & self.known).any(axis=1)
         healthy = self._shared(self.flatness.of_chain(self.group, log.before, log.flat))
@@ -268,6 +281,8 @@ class Observed:
         tells = log.holds & (log.flat != MOVES) & moves[:, None]
         if log.step:
             tells &= log.level > 0
+        if dithers:
+            tells &= (log.level > 0) | ~log.disturbed
         if log.saturated:
             tells &= log.level != log.symbols.top
         tells &= ~self.stays | (log.level == 0)

@@ -36,6 +36,7 @@ from diagnostics.model.middles import (
     agreed,
     around,
     even,
+    recordings_around,
     shortest,
     throughout,
 )
@@ -173,14 +174,17 @@ class Rest:
             finest = max(self.least, min(noise, float(np.median(self.noise[tell]))))
             middle, weight, surely = even(of_pad, noise, finest)
             beside = around(middle, weight >= 1, record)
+            nowhere = np.isnan(beside)
+            if nowhere.any():
+                beside = np.where(nowhere, recordings_around(middle, weight >= 1, record), beside)
             # no load is negative, nor as even: in a contact with most of a pad the lowest tell
             lowest = of_pad[:, : len(tell) // 2 + 1]
             if lowest.shape[1] > _FEWEST:
                 of_lowest, sunk, evenly = even(lowest, noise / 2, noise / 2)
                 enough = lowest.shape[1] >= 2 * _FEWEST
-                raised = evenly * (enough & (beside == 0))
-                sure = np.where(of_lowest < 0, sunk, raised)
-                beside = np.where(sure > 0, sure * of_lowest, beside)
+                raised: Array = evenly * (enough & nowhere)
+                sure: Array = np.where(of_lowest < 0, sunk, raised)
+                beside = sure * of_lowest + (1 - sure) * beside
             shared = weight * middle + (1 - weight) * beside
             if self.pressed[cells].any():
                 lasts = throughout(middle, weight >= 1, record)

@@ -77,13 +77,19 @@ class Symbols:
         """Readings this close to a value hold it."""
         return HOLDS * DITHER * self.rest.full
 
-    def levels(self, record: Record, above: Array, holds: Mask) -> NDArray[np.int8]:
-        """Return the level of each piece, ``[n, D]``. Below rest is a value that a cell ``holds``
-        (bool ``[n, D]``): one that moves may rest lower than in the reference."""
+    def levels(
+        self, record: Record, above: Array, holds: Mask, uneven: Array | float = 0.0
+    ) -> NDArray[np.int8]:
+        """Return the level of each piece, ``[n, D]``.
+
+        Below rest is a value that a cell ``holds`` (bool ``[n, D]``), lower than it ever rested in
+        the reference: one that moves may rest lower. ``uneven``: by how much lower a cell may rest,
+        as its pad does what the reference never saw.
+        """
         level = np.searchsorted(self.edges, root_load(above, self.rest), "right").astype(np.int8)
         level[record.mean >= self.rest.full - self.tolerance] = self.top
         lowest = np.minimum(self.rest.low - DITHER * self.rest.full, -self.rest.near)
-        level[holds & (above < lowest)] = self.top + 1
+        level[holds & (above + uneven < lowest)] = self.top + 1
         return level
 
     def flat(self, record: Record) -> NDArray[np.int8]:

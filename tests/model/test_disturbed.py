@@ -29,6 +29,20 @@ def _coarse(whole: np.ndarray) -> np.ndarray:
     return np.floor(whole / 250) * 250
 
 
+def _eight_levels(whole: np.ndarray) -> np.ndarray:
+    return np.floor(whole / 500) * 500
+
+
+def _each_creeps(whole: np.ndarray) -> np.ndarray:
+    share = np.random.default_rng(8).uniform(0, 300, whole.shape[1])
+    return whole + share * _time(whole) / len(whole)
+
+
+def _ages(whole: np.ndarray) -> np.ndarray:
+    along = _time(whole) / len(whole)
+    return REST + 250 * along + (whole - REST) * (1 - 0.2 * along)
+
+
 def _saturates(whole: np.ndarray) -> np.ndarray:
     return np.minimum(REST + 10 * (whole - REST), 4095)
 
@@ -46,7 +60,18 @@ def _vibrates(whole: np.ndarray) -> np.ndarray:
     return whole + 80 * share * (1 + np.sin(_time(whole) / 1.3))
 
 
-DISTURBANCES = [_hum, _ramp, _coarse, _saturates, _crosstalk, _noise, _vibrates]
+DISTURBANCES = [
+    _hum,
+    _ramp,
+    _coarse,
+    _eight_levels,
+    _each_creeps,
+    _ages,
+    _saturates,
+    _crosstalk,
+    _noise,
+    _vibrates,
+]
 Disturb = Callable[[np.ndarray], np.ndarray]
 
 
@@ -81,3 +106,18 @@ def test_a_cell_that_moves_by_itself_among_them_is_not_alive(fitted, disturb):
     for i, frames in enumerate(log):
         frames[:, 27] = swing[60 * i :][:60].round()
     assert fitted.diagnose(log).verdicts[27] is not Verdict.ALIVE
+
+
+@pytest.mark.parametrize("apart", [10, 15, 20])
+def test_untouched_cells_that_rest_a_little_elsewhere_are_neither_faulty_nor_tested(fitted, apart):
+    rng = np.random.default_rng(apart)
+    rest = REST + rng.uniform(-apart, apart, 64)
+    log = [(rest + rng.normal(0, 6, (60, 64))).round() for _ in range(30)]
+    diagnosis = fitted.diagnose(log)
+    assert not diagnosis.faults
+    assert diagnosis.coverage.test_coverage == 0
+
+
+def test_readings_of_a_converter_with_few_steps_may_be_any_load_of_a_step(fitted):
+    log = [np.floor(frames / 1000) * 1000 for frames in presses(4, 30)]
+    assert not fitted.diagnose(log).faults

@@ -17,6 +17,9 @@ from diagnostics.preprocessing.copies import find_copies
 from diagnostics.preprocessing.readings import held
 from diagnostics.shown import shown
 
+CONVERTER_STEP = 1 / 4095
+"""Step of a 12-bit converter, as the paper's ESP32 has, on the scale of windows."""
+
 
 @shown
 @dataclass(frozen=True, eq=False)
@@ -327,8 +330,8 @@ def split(
     side = np.zeros(len(recordings), dtype=np.int64)
     side[held_out] = 1
     side[chosen] = 2
-    train, val, tested = (windows.select(side[inverse] == i) for i in range(3))
-    return train, val, tested
+    side = side[inverse]
+    return windows.select(side == 0), windows.select(side == 1), windows.select(side == 2)
 
 
 def _draw(

@@ -240,6 +240,9 @@ def _targets_of_frames(
     if not kinds <= set("iubf"):
         raise ValueError("targets are whole numbers (classes) or floats (values), nothing else")
     each = [np.atleast_1d(of).astype(np.float32) for of in each]
+    for i, of in enumerate(each):
+        if not np.isfinite(of).all():
+            raise ValueError(f"the targets of recording {i} are not all finite")
     if all(of.ndim > 2 for of in each):
         return _chunks_of_frames(each, lengths)
     if all(of.shape == (frames,) for of, frames in zip(each, lengths, strict=True)):
@@ -257,8 +260,6 @@ def _targets_of_frames(
                 f"recording {i} has {frames} frames: expected targets [{k}] or [{frames}, {k}], got"
                 f" {list(of.shape)}"
             )
-        if not np.isfinite(of).all():
-            raise ValueError(f"the targets of recording {i} are not all finite")
     return [np.broadcast_to(of, (frames, k)) for of, frames in zip(each, lengths, strict=True)]
 
 
@@ -272,8 +273,6 @@ def _chunks_of_frames(
                 f"recording {i} has {frames} frames: expected actions"
                 f" {[frames, *each[0].shape[1:]]}, got {list(of.shape)}"
             )
-        if not np.isfinite(of).all():
-            raise ValueError(f"the targets of recording {i} are not all finite")
     return list(each)
 
 

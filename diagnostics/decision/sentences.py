@@ -9,7 +9,7 @@ from diagnostics.decision.cell_findings import CellFindings
 from diagnostics.decision.line_cover import Cause
 from diagnostics.faults import Fault, FaultKind
 from diagnostics.layout import SensorLayout
-from diagnostics.wiring import action, counted
+from diagnostics.wiring import DECLARED, action, counted
 
 
 def _does(fault: Fault, found: CellFindings, layout: SensorLayout) -> str:
@@ -68,7 +68,7 @@ def reason_of(fault: Fault, cause: Cause, found: CellFindings, layout: SensorLay
         )
     inferred = len(cause.cells) - len(cause.seen)
     are = "is" if inferred == 1 else "are"
-    if fault.line.kind in ("position", "bus", "group"):
+    if fault.line.kind in DECLARED:
         silent = (
             "are silent"
             if found.silent[fault.cells[0]]

@@ -6,6 +6,11 @@ figures without counts, each with where it is ``from``; where both have a figure
 they are headed *before*. After a run that replaces ``table.jsonl``, ``--measured`` deletes from
 ``figures.jsonl`` what it measured anew.
 
+``other_figures.jsonl`` holds the cells of other tables, in the order of their rows and columns,
+each with the command it is ``from``: ``value`` with a ``spread`` or a ``unit``; ``best`` is what
+others reach, of them ``by``. ``examples/speed`` and ``examples/scale`` hold what their scripts
+measured.
+
 A table stands between ``<!-- table: NAME -->`` and ``<!-- end -->``; what surrounds it is written
 by hand. ``--check`` writes nothing and names the pages that differ; the exit code is then 1.
 """
@@ -13,12 +18,13 @@ by hand. ``--check`` writes nothing and names the pages that differ; the exit co
 from __future__ import annotations
 
 import argparse
+import csv
 import json
 import re
 import sys
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import dataclass, field, replace
+from functools import cached_property, partial
 from pathlib import Path
 
 from arrays import ARRAYS
@@ -27,8 +33,10 @@ from other_sensors import DRIFTS, SENSORS
 
 HERE = Path(__file__).parent
 PAGES = HERE.parent / "docs"
+EXAMPLES = HERE.parent / "examples"
 LIFE = ("hand", "fingertips", "soles", "sliding finger")
 ABSENT = "-"
+FILES = ("table", "figures", "other_figures")
 Table = list[Sequence[str]]  # rows, the first is the head
 
 
@@ -39,15 +47,17 @@ class Measured:
     Args:
         counts: lines of table.jsonl.
         figures: lines of figures.jsonl.
+        others: lines of other_figures.jsonl.
     """
 
     counts: list[dict]
     figures: list[dict]
+    others: list[dict] = field(default_factory=list)
 
     @classmethod
     def read(cls) -> Measured:
-        """Read both files."""
-        return cls(lines_of(HERE / "table.jsonl"), lines_of(HERE / "figures.jsonl"))
+        """Read the files."""
+        return cls(*(lines_of(HERE / f"{name}.jsonl") for name in FILES))
 
     @cached_property
     def samples(self) -> dict[Key, Samples]:
@@ -108,6 +118,11 @@ def lines_of(path: Path) -> list[dict]:
     return [json.loads(line) for line in path.read_text().splitlines()]
 
 
+def rows_of(path: Path) -> list[dict[str, str]]:
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
 def shown(value: float | None, digits: int = 3) -> str:
     if value is None or value != value:
         return ABSENT
@@ -116,6 +131,11 @@ def shown(value: float | None, digits: int = 3) -> str:
 
 def percent(value: float | None) -> str:
     return ABSENT if value is None or value != value else f"{100 * value:.3g} %"
+
+
+def seconds(value: str) -> str:
+    """Return seconds of a CSV file, in two digits."""
+    return f"{float(f'{float(value):.2g}'):g} s"
 
 
 def blamed(value: float | None) -> str:
@@ -364,10 +384,83 @@ def idle(measured: Measured) -> Table:
     return by_array(measured, "disturbed", rows)
 
 
+def of_other(measured: Measured, name: str) -> Table:
+    """A table of other_figures.jsonl."""
+    figures = [figure for figure in measured.others if figure["table"] == name]
+    columns = dict.fromkeys(figure["column"] for figure in figures)
+    table: Table = [["", *columns]]
+    for row in dict.fromkeys(figure["row"] for figure in figures):
+        cells = {
+            figure["column"]: other_shown(figure) for figure in figures if figure["row"] == row
+        }
+        table.append([row, *(cells.get(column, ABSENT) for column in columns)])
+    return table
+
+
+def other_shown(figure: dict) -> str:
+    if "unit" in figure:
+        return f"{figure['value']:g} {figure['unit']}".rstrip()
+    text = shown(figure["value"])
+    if "spread" in figure:
+        text += f" ± {shown(figure['spread'])}"
+    if "best" in figure:
+        text += f" / {shown(figure['best'])} {figure['by']}"
+    return text
+
+
+CORE = (  # what the page says, name in core_speed.csv
+    ("training, a step of 32 windows", "training step, 32 windows"),
+    ("fine-tuning, a step", "fine-tuning step, 32 windows"),
+    ("prediction of 256 windows", "prediction on torch, 256 windows"),
+    ("fill, 256 windows", "fill: applied to 256 windows"),
+    ("new head, 20 of 220 cells, 2,600 windows", "adapt, method head"),
+    ("fit of the diagnosis on 14 grasps", "diagnosis: fit on 14 grasps"),
+    ("diagnosis of 2,000 frames", "diagnosis: a log of 2000 frames"),
+)
+
+
+def core(_: Measured) -> Table:
+    """Jobs beside a matrix product."""
+    jobs = {job["name"]: job for job in rows_of(EXAMPLES / "speed" / "core_speed.csv")}
+    table: Table = [["job", "time", "share of the matrix product"]]
+    for name, job in CORE:
+        share = float(jobs[job]["share_of_product"])
+        of_product = f"{100 * share:.0f} %" if share else ABSENT
+        table.append([name, seconds(jobs[job]["seconds"]), of_product])
+    return table
+
+
+SCALED = ("fit", "diagnose", "fill build")
+
+
+def scale(_: Measured) -> Table:
+    """Skins of one pad and of many."""
+    measured: dict[tuple[str, int], dict[str, dict[str, str]]] = {}
+    for row in rows_of(EXAMPLES / "scale" / "scale.csv"):
+        measured.setdefault((row["pads"], int(row["cells"])), {})[row["stage"]] = row
+    head = ["cells", "fit", "diagnosis", "fill", "memory"]
+    table: Table = [[*head, "precision", "recall", "wires found", "invented"]]
+    for (pads, cells), stages in measured.items():
+        found = stages["diagnose"]
+        times = [seconds(stages[stage]["cpu"]) for stage in SCALED]
+        memory = max(float(stage["peak_mb"]) for stage in stages.values())
+        shares = [shown(float(found[what])) for what in ("precision", "recall")]
+        wires = [f"{found['named']} of {found['wires']}", found["invented"]]
+        table.append([f"{cells:,}, {pads}", *times, f"{memory:,.0f} MB", *shares, *wires])
+    return table
+
+
 TABLES: dict[str, Callable[[Measured], Table]] = {
     table.__name__: table
     for table in (
-        hand, rewired, sensors, cold, skins, moving, failing, disturbed, short, idle
+        hand, rewired, sensors, cold, skins, moving, failing, disturbed, short, idle, core,
+        scale,
+    )
+} | {
+    name: partial(of_other, name=name)
+    for name in (
+        "repaired", "fresh", "simulated", "every_sensor", "forecast", "new_objects", "iclabel",
+        "tuning", "gpu",
     )
 }  # fmt: skip
 BLOCK = re.compile(r"<!-- table: (\w+) -->\n.*?<!-- end -->", re.DOTALL)
@@ -394,6 +487,11 @@ def written(text: str, measured: Measured) -> str:
     return BLOCK.sub(replaced, text)
 
 
+def with_tables() -> list[Path]:
+    """Return the pages that hold tables."""
+    return [page for page in sorted(PAGES.glob("*.md")) if BLOCK.search(page.read_text())]
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--check", action="store_true", help="write nothing, name what differs")
@@ -406,7 +504,7 @@ def main() -> int:
         lines = (json.dumps(figure) + "\n" for figure in measured.figures)
         (HERE / "figures.jsonl").write_text("".join(lines))
     differs = 0
-    for page in sorted(PAGES.glob("results*.md")):
+    for page in with_tables():
         before = page.read_text()
         after = written(before, measured)
         if before == after:

@@ -47,16 +47,81 @@ class FaultKind(str, Enum):
 
     __str__ = str.__str__
 
+    @property
+    def letter(self) -> str:
+        """What a map of the cells shows."""
+        return _WORDS[self].letter
+
+    @property
+    def check(self) -> str:
+        """What to check of a single cell."""
+        return _WORDS[self].check
+
+    @property
+    def does(self) -> str:
+        """What a cell does, with ``{value}`` and ``{unit}``; empty: it reads a value."""
+        return _WORDS[self].does
+
     def verb(self, *, plural: bool = False) -> str:
         """Return what a cell or a wire of this kind does or is: "is stuck", "drifts"."""
-        single, several = _VERBS.get(self, (f"is {self}", f"are {self}"))
+        single, several = _WORDS[self].verbs or (f"is {self}", f"are {self}")
         return several if plural else single
 
 
-_VERBS = {
-    FaultKind.DRIFT: ("drifts", "drift"),
-    FaultKind.COPY: ("is a copy", "are copies"),
-    FaultKind.ALIAS: ("reads another cell", "read other cells"),
+@dataclass(frozen=True)
+class _Words:
+    letter: str
+    check: str = "the cell and its traces for a short circuit"
+    does: str = ""
+    verbs: tuple[str, str] | None = None
+
+
+_WORDS = {
+    FaultKind.OPEN: _Words("O", "its solder joint and trace"),
+    FaultKind.SHORT: _Words("S"),
+    FaultKind.STUCK: _Words("K"),
+    FaultKind.ALIAS: _Words("A", verbs=("reads another cell", "read other cells")),
+    FaultKind.INTERMITTENT: _Words(
+        "I",
+        "its solder joint and trace for a loose contact",
+        "blinks between its load and {value:.4g} {unit}",
+    ),
+    FaultKind.NOISY: _Words(
+        "N",
+        "its connection and shielding",
+        "is far noisier than a healthy cell under the same load",
+    ),
+    FaultKind.DRIFT: _Words(
+        "D",
+        "the cell for wear or dirt, and calibrate it again",
+        "moves, but never returns to its baseline",
+        ("drifts", "drift"),
+    ),
+    FaultKind.FLOATING: _Words(
+        "F",
+        "its trace for a break: an open input picks up what is around it",
+        "moves by itself, whatever the cells around it read",
+    ),
+    FaultKind.LATE: _Words(
+        "L",
+        "the converter and the buffer that it is read from",
+        "follows the cells around it about {value:.0f} frames late",
+    ),
+    FaultKind.COPY: _Words(
+        "C",
+        "the multiplexer and the order in which cells are read",
+        verbs=("is a copy", "are copies"),
+    ),
+    FaultKind.CLAMPED: _Words(
+        "M",
+        "its amplifier and supply",
+        "never reads more than {value:.4g} {unit}, however much the cells around it are loaded",
+    ),
+    FaultKind.WEAK: _Words(
+        "W",
+        "the cell for wear or dirt, and calibrate it again",
+        "reads {value:.2g} times what it should",
+    ),
 }
 
 

@@ -16,7 +16,9 @@ LineKind = Literal[
     "row", "column", "row_address", "column_address", "converter", "position", "bus", "group"
 ]
 
-_INSIDE_OUT = "position", "group", "bus"  # of lines with the same cells
+DECLARED = "position", "group", "bus"
+"""Kinds of lines that are no wires of a matrix; of lines with the same cells, inside out."""
+
 _ACTIONS = {
     "position": "check the chip and the solder joints of {}",
     "connector": "reseat {}",
@@ -142,7 +144,7 @@ def nested(served: Mapping[Line, Cells]) -> dict[Line, Cells]:
     """
     # Of two groups with the same cells the earlier one is the inner one.
     order = sorted(
-        served, key=lambda line: (len(served[line]), _INSIDE_OUT.index(line.kind), line.index)
+        served, key=lambda line: (len(served[line]), DECLARED.index(line.kind), line.index)
     )
     inner: dict[int, Line] = {}
     for line in reversed(order):

@@ -163,7 +163,7 @@ def measure(layout: SensorLayout, frames: int) -> None:
     began = time.process_time()
     diagnosis = diagnoser.diagnose(seen)
     measured("diagnose", time.process_time() - began, **found(log, seen, faults, diagnosis, layout))
-    monitor = Monitor(diagnoser)
+    monitor = Monitor(diagnoser, wait=True)
     times = []
     stream = np.concatenate(seen)
     began = time.process_time()  # of all threads

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from adaptfault.adaptation.adapter import Adapter
-from adaptfault.data.windows import Windows, evenly
+from adaptfault.data.windows import CONVERTER_STEP, Windows, evenly
 from adaptfault.imputation.statistics import CellStatistics
 from adaptfault.models.any_model import network_from_config
 from adaptfault.models.network import tensors_of
@@ -24,7 +24,6 @@ WINDOWS_SCHEMA = "adaptfault.windows/1"
 LIMIT = 20_000_000  # bytes of an adapter, unless its network alone is larger
 
 _SHARE = 0.5  # of the limit: the most that windows take
-_FINEST = 1 / 4095  # step for readings without visible converter steps: a 12-bit converter
 _MOST_STEPS = 65_535
 _COARSEST = 1e-3  # largest error of a 16-bit float, in units of the largest of its tensor
 _EXTRA = "extra."  # before the name of what a policy sees beside touch
@@ -124,9 +123,8 @@ def load_adapter(path: Place) -> Adapter:
             parts = [replace(part, y=part.y.reshape(-1, *shape)) for part in parts]
         adapter = Adapter(model.eval(), *parts, task=task)
         if task == "classification":
-            adapter.targets, adapter.validation_targets = (
-                tensors[f"{name}.targets"].float().numpy() for name in ("train", "validation")
-            )
+            adapter.targets = tensors["train.targets"].float().numpy()
+            adapter.validation_targets = tensors["validation.targets"].float().numpy()
         d = model.layout.n_cells
         covariance = np.zeros((d, d))
         covariance[np.triu_indices(d)] = tensors["statistics.covariance"].numpy()
@@ -225,7 +223,7 @@ def _steps(x: NDArray[np.float32]) -> tuple[float, float]:
         off = (values - low) / step
         if np.abs(off - np.rint(off)).max() < 0.01:
             return low, step
-    return low, max(_FINEST, width / _MOST_STEPS)
+    return low, max(CONVERTER_STEP, width / _MOST_STEPS)
 
 
 def _whole(state: dict[str, Tensor]) -> dict[str, Tensor]:

@@ -7,9 +7,9 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from adaptfault.data.windows import CONVERTER_STEP
 from diagnostics import SensorLayout
 
-_STEP = 1 / 4095  # of a 12-bit converter: a load below it has no place
 _CELL = 1 / 12  # variance of a load that is spread evenly over the width of a cell
 
 
@@ -48,11 +48,13 @@ class ContactMoments(nn.Module):
 
     def _of(self, pads: Tensor) -> Tensor:
         """Map readings ``[..., cells]`` of pads to ``[..., 8]``."""
-        total, *sums = (pads @ self.products).unbind(-1)
-        y, x, yy, xx, yx = (each / (total + _STEP) for each in sums)
+        moments = pads @ self.products
+        total = moments[..., 0]
+        shares = moments[..., 1:] / (total + CONVERTER_STEP).unsqueeze(-1)
+        y, x, yy, xx, yx = shares.unbind(-1)
         along = [
             (square - mean * mean).clamp_min(0.0).add(_CELL).sqrt()
             for square, mean in ((yy, y), (xx, x))
         ]
-        size = total / (pads.square().sum(-1).sqrt() + _STEP)
+        size = total / (pads.square().sum(-1).sqrt() + CONVERTER_STEP)
         return torch.stack([total, y, x, *along, yx - y * x, pads.amax(-1).sqrt(), size], dim=-1)

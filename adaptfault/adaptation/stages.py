@@ -273,9 +273,8 @@ class Run:
         if self._too_long(reduced, len(self.training) + len(self.validation)):
             return None
         used = evenly(len(self.training), MOST_WINDOWS - len(self.validation))
-        first, second = (
-            self._views(reduced, of) for of in (self.training.select(used), self.validation)
-        )
+        first = self._views(reduced, self.training.select(used))
+        second = self._views(reduced, self.validation)
         folds = np.unique(self.validation.recording, return_inverse=True)[1] % _FOLDS
         targets = self.fault_free.targets[used], self.fault_free.validation_targets
         return self._fit(first, second, *targets, folds)
@@ -373,14 +372,16 @@ class Run:
         The values of a regression are standardised meanwhile, if the last layer of the network can
         take up their units and no loss is given. A ``fresh`` network has not taken them up.
         """
-        training, validation = self.training, self.validation
+        training = self.training
+        validation = self.validation
         units = None
         values = self.fault_free.task == "regression" and self.fault_free.loss is None
         if values and foldable(reduced.network, training.extra):
             units = ValueUnits.of(training)
             if not fresh:
                 units.unfold(reduced.network)
-            training, validation = units.standardised(training), units.standardised(validation)
+            training = units.standardised(training)
+            validation = units.standardised(validation)
         history = train(
             reduced,
             training,

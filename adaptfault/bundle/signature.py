@@ -75,20 +75,29 @@ def verify(
     return int(signed["serial"]), versions
 
 
-def read_private_key(path: str | PathLike[str]) -> Ed25519PrivateKey:
-    """Return the ed25519 key in a PEM file; raises ValueError, also where cryptography is not
-    installed."""
+def _key_in(path: str | PathLike[str]) -> Any:
+    """Return the key in a PEM file, private or public; None: there is none without a password."""
     check_file(Path(path))
     try:
         from cryptography.exceptions import UnsupportedAlgorithm
-        from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
-        from cryptography.hazmat.primitives.serialization import load_pem_private_key
+        from cryptography.hazmat.primitives import serialization
     except ImportError:
         raise ValueError(_MISSING) from None
+    data = Path(path).read_bytes()
     try:
-        key = load_pem_private_key(Path(path).read_bytes(), password=None)
+        if b"PRIVATE KEY" in data:
+            return serialization.load_pem_private_key(data, password=None)
+        return serialization.load_pem_public_key(data)
     except (ValueError, TypeError, UnsupportedAlgorithm):  # TypeError: it has a password
-        key = None
+        return None
+
+
+def read_private_key(path: str | PathLike[str]) -> Ed25519PrivateKey:
+    """Return the ed25519 key in a PEM file; raises ValueError, also where cryptography is not
+    installed."""
+    key = _key_in(path)
+    from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+
     if not isinstance(key, Ed25519PrivateKey):
         raise ValueError(
             f"{path}: expected an ed25519 key without password; openssl genpkey -algorithm ed25519"
@@ -97,20 +106,14 @@ def read_private_key(path: str | PathLike[str]) -> Ed25519PrivateKey:
 
 
 def _read_public_key(path: str | PathLike[str]) -> Ed25519PublicKey:
-    check_file(Path(path))
-    try:
-        from cryptography.exceptions import UnsupportedAlgorithm
-        from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
-        from cryptography.hazmat.primitives.serialization import load_pem_public_key
-    except ImportError:
-        raise ValueError(_MISSING) from None
-    data = Path(path).read_bytes()
-    if b"PRIVATE KEY" in data:
-        return read_private_key(path).public_key()
-    try:
-        key = load_pem_public_key(data)
-    except (ValueError, UnsupportedAlgorithm):
-        key = None
+    key = _key_in(path)
+    from cryptography.hazmat.primitives.asymmetric.ed25519 import (
+        Ed25519PrivateKey,
+        Ed25519PublicKey,
+    )
+
+    if isinstance(key, Ed25519PrivateKey):
+        return key.public_key()
     if not isinstance(key, Ed25519PublicKey):
         raise ValueError(
             f"{path}: expected the public part of an ed25519 key; openssl pkey -in KEY -pubout"

@@ -255,7 +255,8 @@ def _trained(
         args.say(f"continuing from {checkpoint}")
     training, validation = parts[:2]
     if units is not None:
-        training, validation = units.standardised(training), units.standardised(validation)
+        training = units.standardised(training)
+        validation = units.standardised(validation)
     history = train(
         model,
         training,
@@ -344,11 +345,13 @@ def _told(
     if isinstance(scores, ValueScores):
         figure = plot_value_training(*values, scores, history, names)
         problems = value_training_problems(scores, history)
-        told, trained = scores.named(names), history.told("R2")
+        told = scores.named(names)
+        trained = history.told("R2")
     else:
         figure = plot_training(scores, history, names)
         problems = training_problems(scores, history, names)
-        told, trained = str(scores), str(history)
+        told = str(scores)
+        trained = str(history)
     atomic_figure(picture, figure, dpi=120)
     for problem in problems:
         print(f"warning: {problem}", file=sys.stderr)

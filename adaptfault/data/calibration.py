@@ -62,7 +62,8 @@ class Calibration:
     force: NDArray[np.float64]
 
     def __post_init__(self) -> None:
-        raw, force = (np.array(table, dtype=np.float64) for table in (self.raw, self.force))
+        raw = np.array(self.raw, dtype=np.float64)
+        force = np.array(self.force, dtype=np.float64)
         if raw.ndim != 2 or raw.shape != force.shape:
             raise ValueError(
                 f"expected raw and force of one shape [D, P], got {list(raw.shape)} and"

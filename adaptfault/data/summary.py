@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from adaptfault.data.documents import members
 from diagnostics import SensorLayout
 from diagnostics.preprocessing.array_likes import is_array
+from diagnostics.preprocessing.tolerance import least_step
 from diagnostics.shown import shown
 
 if TYPE_CHECKING:
@@ -90,7 +91,8 @@ class Summary:
         }
 
     def __str__(self) -> str:
-        layout, present = self.layout, self.layout.is_cell
+        layout = self.layout
+        present = layout.is_cell
         least = int(self.lengths.min())
         most = int(self.lengths.max())
         missing = int(self.missing[present].sum())
@@ -245,10 +247,8 @@ def _rest(frames: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def _step(frames: NDArray[np.float64]) -> float | None:
     """Return the least difference between two distinct readings, above the rounding of float32."""
-    values = np.unique(frames[np.isfinite(frames)].astype(np.float32)).astype(np.float64)
-    gaps = np.diff(values)
-    gaps = gaps[gaps > 1e-6 * max(abs(values[0]), abs(values[-1]))] if gaps.size else gaps
-    return float(gaps.min()) if gaps.size else None
+    values = frames[np.isfinite(frames)].astype(np.float32).astype(np.float64)
+    return least_step(values, np.abs(values).max(initial=0.0)) or None
 
 
 def _least(values: NDArray[np.float64]) -> float | None:

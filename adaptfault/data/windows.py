@@ -17,6 +17,9 @@ from diagnostics.preprocessing.copies import find_copies
 from diagnostics.preprocessing.readings import held
 from diagnostics.shown import shown
 
+CONVERTER_STEP = 1 / 4095
+"""Step of a 12-bit converter, as the paper's ESP32 has, on the scale of windows."""
+
 
 @shown
 @dataclass(frozen=True, eq=False)
@@ -237,6 +240,9 @@ def _targets_of_frames(
     if not kinds <= set("iubf"):
         raise ValueError("targets are whole numbers (classes) or floats (values), nothing else")
     each = [np.atleast_1d(of).astype(np.float32) for of in each]
+    for i, of in enumerate(each):
+        if not np.isfinite(of).all():
+            raise ValueError(f"the targets of recording {i} are not all finite")
     if all(of.ndim > 2 for of in each):
         return _chunks_of_frames(each, lengths)
     if all(of.shape == (frames,) for of, frames in zip(each, lengths, strict=True)):
@@ -254,8 +260,6 @@ def _targets_of_frames(
                 f"recording {i} has {frames} frames: expected targets [{k}] or [{frames}, {k}], got"
                 f" {list(of.shape)}"
             )
-        if not np.isfinite(of).all():
-            raise ValueError(f"the targets of recording {i} are not all finite")
     return [np.broadcast_to(of, (frames, k)) for of, frames in zip(each, lengths, strict=True)]
 
 
@@ -269,8 +273,6 @@ def _chunks_of_frames(
                 f"recording {i} has {frames} frames: expected actions"
                 f" {[frames, *each[0].shape[1:]]}, got {list(of.shape)}"
             )
-        if not np.isfinite(of).all():
-            raise ValueError(f"the targets of recording {i} are not all finite")
     return list(each)
 
 
@@ -327,8 +329,8 @@ def split(
     side = np.zeros(len(recordings), dtype=np.int64)
     side[held_out] = 1
     side[chosen] = 2
-    train, val, tested = (windows.select(side[inverse] == i) for i in range(3))
-    return train, val, tested
+    side = side[inverse]
+    return windows.select(side == 0), windows.select(side == 1), windows.select(side == 2)
 
 
 def _draw(

@@ -202,7 +202,8 @@ def _curves(
     from matplotlib.ticker import MaxNLocator
 
     epochs = np.arange(1, history.epochs + 1)
-    loss, accuracy = (figure.add_subplot(place) for place in places)
+    loss = figure.add_subplot(places[0])
+    accuracy = figure.add_subplot(places[1])
     loss.plot(epochs, history.train_loss, ".-", label="training")
     loss.plot(epochs, history.validation_loss, ".-", label="validation")
     loss.set_ylabel(criterion)

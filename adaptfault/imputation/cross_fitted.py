@@ -39,12 +39,14 @@ class CrossFitted:
         healthy = fault_set.healthy
         missing = np.flatnonzero(fault_set.mask)
         mean = self._whole.mean[missing]
-        pairs = []
+        predicted = []
+        readings = []
         for half, frames in zip(self._halves, self._held_out, strict=True):
             weight, bias = half.conditional_mean(fault_set)
-            pairs.append((frames[:, healthy] @ weight.T + (bias - mean), frames[:, missing] - mean))
-        predicted, readings = (np.concatenate(values) for values in zip(*pairs, strict=True))
-        correction = Recalibration.fit(predicted, readings, total=len(readings))
+            predicted.append(frames[:, healthy] @ weight.T + (bias - mean))
+            readings.append(frames[:, missing] - mean)
+        held_out = np.concatenate(readings)
+        correction = Recalibration.fit(np.concatenate(predicted), held_out, total=len(held_out))
         weight, bias = self._whole.conditional_mean(fault_set)
         bias = mean + correction.gain * (bias - mean) + correction.offset
         return correction.gain[:, None] * weight, bias, correction.deviation

@@ -43,9 +43,8 @@ def random_fault_set(layout: SensorLayout, rng: np.random.Generator) -> FaultSet
             )
             np.moveaxis(lost[which], axis, 0)[lines] = True
         case "block":
-            (top, bottom), (left, right) = (
-                np.sort(rng.choice(n + 1, 2, replace=False)) for n in (rows, cols)
-            )
+            top, bottom = np.sort(rng.choice(rows + 1, 2, replace=False))
+            left, right = np.sort(rng.choice(cols + 1, 2, replace=False))
             lost[which, top:bottom, left:right] = True
         case "pad":
             lost[rng.integers(pads)] = True

@@ -96,10 +96,8 @@ class NearestFill(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         """Map ``[N, T, D-k]`` to ``[N, T, D]``; imputed readings are clipped to 0..1."""
         # The squared norm of the frame itself cancels in the softmax.
-        roots, own = (
-            x.clamp_min(0.0).sqrt() * (2 / self.width),
-            self.roots.square().sum(1) / -self.width,
-        )
+        roots = x.clamp_min(0.0).sqrt() * (2 / self.width)
+        own = self.roots.square().sum(1) / -self.width
         # (N, T, M), in one pass
         weights = torch.softmax(nn.functional.linear(roots, self.roots, own), dim=-1)
         return self.linear.merge(x, self.linear.missing(x) + weights @ self.residuals)

@@ -2,50 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from datetime import datetime
 from functools import partial
 from pathlib import Path
-from typing import Literal
 
 from adaptfault.pages.html_page import Picture, render
 from diagnostics import Diagnosis
 from diagnostics.decision.grouped_faults import by_group
 from diagnostics.decision.numbering import Numbering
 
-Verdict = Literal["call", "watch", "nothing"]
+HEADLINES = ("Nothing to do", "Watch: single cells are faulty", "Call a technician")
+"""Of each severity."""
 
-HEADLINES: dict[Verdict, str] = {
-    "call": "Call a technician",
-    "watch": "Watch: single cells are faulty",
-    "nothing": "Nothing to do",
-}
-
-OF_A_DATA_SET: dict[Verdict, str] = {
-    "call": "Not fit for training as it is",
-    "watch": "Train with care: see what was found",
-    "nothing": "Fit for training, as far as it was tested",
-}
+OF_A_DATA_SET = (
+    "Fit for training, as far as it was tested",
+    "Train with care: see what was found",
+    "Not fit for training as it is",
+)
 
 _TESTED = 0.5  # below this share of tested cells, a log without a fault is no proof of health
-
-
-def verdict(diagnosis: Diagnosis, code: int | None = None) -> Verdict:
-    """Return the verdict of a diagnosis: ``"call"`` for a wire or a tenth of the cells, ``"watch"``
-    for single cells.
-
-    A log without a fault that tested less than half of the cells gives ``"watch"`` as well.
-    ``code`` is the exit code of ``adaptfault diagnose``, where more is known than the faults: 2
-    gives ``"call"``, 1 at least ``"watch"``.
-    """
-    code = diagnosis.exit_code if code is None else code
-    if code >= 2:
-        return "call"
-    return (
-        "watch"
-        if code or diagnosis.exit_code or diagnosis.coverage.test_coverage < _TESTED
-        else "nothing"
-    )
 
 
 def write_diagnosis(
@@ -57,7 +33,7 @@ def write_diagnosis(
     code: int | None = None,
     notes: Sequence[str] = (),
     count_from: int = 0,
-    headlines: Mapping[Verdict, str] = HEADLINES,
+    headlines: Sequence[str] = HEADLINES,
 ) -> Path:
     """Write the page; return its path.
 
@@ -66,29 +42,32 @@ def write_diagnosis(
         diagnosis: what to show.
         name: of the log.
         reference: whether the diagnosis had fault-free recordings to compare with.
-        code: the exit code of the command; None: that of the diagnosis.
+        code: the exit code of the command; None: that of the diagnosis. The page shows
+            1 at least where a fault was found, or less than half of the cells were tested.
         notes: sentences below the verdict: a changed sensor, exchanged wires, faults that are
             handled.
         count_from: number of the first pad, row, column and cell on the page.
-        headlines: of each verdict.
+        headlines: of each severity.
 
     Raises:
         OSError: the folder cannot be written.
     """
-    state = verdict(diagnosis, code)
-    headline = headlines[state]
-    if state == "watch" and diagnosis.faults and code is not None and code < diagnosis.exit_code:
+    found = diagnosis.exit_code
+    untested = diagnosis.coverage.test_coverage < _TESTED
+    severity = min(found if code is None else code, 2)
+    if severity == 0 and (found or untested):
+        severity = 1
+    headline = headlines[severity]
+    if severity == 1 and diagnosis.faults and code is not None and code < found:
         headline = "Watch: the running version handles the faults"
-    elif state == "watch" and not diagnosis.faults:
-        untested = diagnosis.coverage.test_coverage < _TESTED
-        headline = "No fault found, but " + (
-            "most cells were not tested" if untested else "see the reason"
-        )
+    elif severity == 1 and not diagnosis.faults:
+        why = "most cells were not tested" if untested else "see the reason"
+        headline = f"No fault found, but {why}"
     return render(
         path,
         "pages/diagnosis.html",
         name=name,
-        state=state,
+        bad=severity >= 2,
         notes=[
             note[0].upper() + note[1:]
             for note in (*notes, *(load.reason for load in diagnosis.static_loads))

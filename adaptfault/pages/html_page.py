@@ -14,8 +14,7 @@ from typing import TYPE_CHECKING, Any
 import adaptfault
 from adaptfault.data.atomic import atomic_write
 from diagnostics.decision.coverage import percent
-from diagnostics.decision.plot import PAGE
-from diagnostics.decision.result import LETTERS, Diagnosis
+from diagnostics.decision.plot import PAGE, legend_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -38,19 +37,13 @@ def render(
     rooms = FileSystemLoader(list(adaptfault.__path__))
     environment = Environment(loader=rooms, autoescape=True, undefined=StrictUndefined)
     environment.filters["percent"] = percent
-    environment.filters["legend"] = legend
+    environment.filters["legend"] = legend_of
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     values["versions"] = ", ".join(f"{name} {version_of(name)}" for name in packages)
     values["python"] = platform.python_version()
     atomic_write(path, environment.get_template(template).render(values).encode())
     return path
-
-
-def legend(diagnosis: Diagnosis) -> str:
-    """Return the letters of the kinds of fault that are on the map, as "O open, S short"."""
-    kinds = {fault.kind for fault in diagnosis.faults}
-    return ", ".join(f"{letter} {kind}" for kind, letter in LETTERS.items() if kind in kinds)
 
 
 @dataclass(frozen=True)

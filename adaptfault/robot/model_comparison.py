@@ -145,14 +145,12 @@ def _collapsed(
     for part in range(y.shape[1]) if y.ndim == 2 else np.unique(y):
         of_it = every if y.ndim == 2 else y == part
         column = [part] if y.ndim == 2 else slice(None)
-        before, after = (
-            np.bincount(
-                inverse[of_it],
-                weights=_of_windows(y[of_it][..., column], given[of_it][..., column]),
-                minlength=drawn.shape[1],
-            )[drawn].sum(axis=1)
-            for given in predicted
-        )
+        reached = []
+        for given in predicted:
+            weights = _of_windows(y[of_it][..., column], given[of_it][..., column])
+            summed = np.bincount(inverse[of_it], weights, drawn.shape[1])
+            reached.append(summed[drawn].sum(axis=1))
+        before, after = reached
         if (after < np.minimum(before, _COLLAPSE * before)).mean() >= _CONFIDENCE:
             collapsed.append(int(part))
     return tuple(collapsed)

@@ -50,15 +50,8 @@ def concluded(
     probability, inferred = _with_causes(probability, causes)
     # Noise alone is no test; nor is movement, where the reference tells how cells depend on each
     # other; nor is a line that a shorted crossing pulls.
-    shown = judged.shown
-    shorts = [f.cells[0] for f in causes if f.kind is FaultKind.SHORT and f.line is None]
-    if judged.pulled is not None and shorts:
-        # a cell that reads a part of its load may be pulled
-        misleads = inferred.copy()
-        misleads[[c for f in causes if f.kind is FaultKind.WEAK for c in f.cells]] = False
-        pulled = judged.pulled(place[np.array(shorts)], misleads[order])
-        causes = pulling(causes, pulled[place], layout)
-        shown = shown & ~pulled
+    pulled = _pulled(judged, causes, inferred, order)
+    causes = pulling(causes, pulled, layout)
     scale = stream.scale
     working = np.empty_like(inferred)
     moved = bool((stream.runs.moved & stream.present).any())
@@ -69,7 +62,7 @@ def concluded(
         layout=layout,
         faults=causes,
         probability=probability,
-        tested=(found.alive & shown[place]) | inferred,
+        tested=(found.alive & judged.shown[place] & ~pulled) | inferred,
         transport=stream.transport.faults(
             rest + scale.near, working, layout.rate, moved, falls=falls
         ),
@@ -80,6 +73,20 @@ def concluded(
         static_loads=tuple(still),
         contradicting=judged.contradicting,
     )
+
+
+def _pulled(
+    judged: Judged, causes: Sequence[Fault], inferred: Mask, order: NDArray[np.intp]
+) -> Mask:
+    """Return the cells that shorted crossings pull, bool ``[D]``; ``inferred``: of the causes."""
+    shorts = [f.cells[0] for f in causes if f.kind is FaultKind.SHORT and f.line is None]
+    if judged.pulled is None or not shorts:
+        return np.zeros_like(inferred)
+    # a cell that reads a part of its load may be pulled
+    misleads = inferred.copy()
+    misleads[[c for f in causes if f.kind is FaultKind.WEAK for c in f.cells]] = False
+    place = np.argsort(order)
+    return judged.pulled(place[np.array(shorts)], misleads[order])[place]
 
 
 def _unused(

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from diagnostics.faults import FaultKind
+
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from diagnostics.faults import Fault, FaultKind
+    from diagnostics.faults import Fault
     from diagnostics.layout import SensorLayout
 
 PAGE = 10.0
@@ -31,7 +33,6 @@ def draw(
     layout: SensorLayout,
     verdicts: NDArray[np.object_],
     faults: Sequence[Fault],
-    letters: Mapping[FaultKind, str],
     page: float,
     count_from: int = 0,
 ) -> Figure:
@@ -42,7 +43,6 @@ def draw(
         layout: the array.
         verdicts: of its cells, ``[D]``.
         faults: in it.
-        letters: letter of each fault kind.
         page: width of the page, in inches.
         count_from: number of the first pad, row and column.
     """
@@ -70,11 +70,9 @@ def draw(
     for cell, kind in kind_of.items():
         pad, row, col = (int(i) for i in np.unravel_index(cell, layout.shape))
         axes[pad].text(
-            col, row, letters[kind], ha="center", va="center", color="white", fontsize=size
+            col, row, kind.letter, ha="center", va="center", color="white", fontsize=size
         )
-    shown = ", ".join(
-        f"{letter} {kind.value}" for kind, letter in letters.items() if kind in kind_of.values()
-    )
+    shown = legend_of(faults)
     legend = {
         "alive": _ALIVE,
         f"faulty: {shown}" if shown else "faulty": _FAULTY,
@@ -87,6 +85,12 @@ def draw(
         fontsize=8,
     )
     return figure
+
+
+def legend_of(faults: Iterable[Fault]) -> str:
+    """Return the letters of the kinds of faults that there are, as "O open, S short"."""
+    there = {fault.kind for fault in faults}
+    return ", ".join(f"{kind.letter} {kind}" for kind in FaultKind if kind in there)
 
 
 def draw_forces(

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from diagnostics.decision.coverage import Coverage, coverage
 from diagnostics.decision.numbering import Numbering
 from diagnostics.decision.static_load import StaticLoad
-from diagnostics.faults import Fault, FaultKind, FaultSet
+from diagnostics.faults import Fault, FaultSet
 from diagnostics.layout import SensorLayout
 from diagnostics.preprocessing.transport import TransportFault
 from diagnostics.shown import shown
@@ -25,22 +25,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 SCHEMA = "adaptfault.diagnosis/1"
-
-LETTERS = {
-    FaultKind.OPEN: "O",
-    FaultKind.SHORT: "S",
-    FaultKind.STUCK: "K",
-    FaultKind.ALIAS: "A",
-    FaultKind.INTERMITTENT: "I",
-    FaultKind.NOISY: "N",
-    FaultKind.DRIFT: "D",
-    FaultKind.FLOATING: "F",
-    FaultKind.LATE: "L",
-    FaultKind.COPY: "C",
-    FaultKind.CLAMPED: "M",
-    FaultKind.WEAK: "W",
-}
-
 
 _SURE = 0.95
 
@@ -230,7 +214,7 @@ class Diagnosis:
         """
         signs = np.where(self.verdicts == Verdict.UNTESTED, "?", ".")
         for fault in self.faults:
-            signs[list(fault.cells)] = LETTERS[fault.kind]
+            signs[list(fault.cells)] = fault.kind.letter
         grid = self.layout.grid(np.where(self.layout.is_cell, signs, " "))
         names = [f"pad {pad + count_from}" for pad in range(self.layout.pads)]
         width = max(2 * self.layout.shape[2] - 1, len(names[-1]))
@@ -303,7 +287,7 @@ class Diagnosis:
         by side go below. Pads, rows and columns are numbered from ``count_from``."""
         from diagnostics.decision.plot import draw
 
-        return draw(self.layout, self.verdicts, self.faults, LETTERS, page, count_from)
+        return draw(self.layout, self.verdicts, self.faults, page, count_from)
 
     def to_dict(self) -> dict[str, Any]:
         """Return a JSON-safe dict (no NaN) that :meth:`from_dict` reads."""

@@ -9,32 +9,7 @@ from diagnostics.decision.cell_findings import CellFindings
 from diagnostics.decision.line_cover import Cause
 from diagnostics.faults import Fault, FaultKind
 from diagnostics.layout import SensorLayout
-from diagnostics.wiring import action, counted
-
-_DOING = {
-    FaultKind.INTERMITTENT: "blinks between its load and {value:.4g} {unit}",
-    FaultKind.NOISY: "is far noisier than a healthy cell under the same load",
-    FaultKind.DRIFT: "moves, but never returns to its baseline",
-    FaultKind.FLOATING: "moves by itself, whatever the cells around it read",
-    FaultKind.LATE: "follows the cells around it about {value:.0f} frames late",
-    FaultKind.WEAK: "reads {value:.2g} times what it should",
-    FaultKind.CLAMPED: (
-        "never reads more than {value:.4g} {unit}, however much the cells around it are loaded"
-    ),
-}
-
-
-_CHECKS = {
-    FaultKind.OPEN: "its solder joint and trace",
-    FaultKind.INTERMITTENT: "its solder joint and trace for a loose contact",
-    FaultKind.NOISY: "its connection and shielding",
-    FaultKind.DRIFT: "the cell for wear or dirt, and calibrate it again",
-    FaultKind.FLOATING: "its trace for a break: an open input picks up what is around it",
-    FaultKind.LATE: "the converter and the buffer that it is read from",
-    FaultKind.COPY: "the multiplexer and the order in which cells are read",
-    FaultKind.WEAK: "the cell for wear or dirt, and calibrate it again",
-    FaultKind.CLAMPED: "its amplifier and supply",
-}
+from diagnostics.wiring import DECLARED, action, counted
 
 
 def _does(fault: Fault, found: CellFindings, layout: SensorLayout) -> str:
@@ -60,8 +35,8 @@ def _does(fault: Fault, found: CellFindings, layout: SensorLayout) -> str:
             f"reads nothing in {share:.0%} of the contacts that load the cells around it, and its"
             " load in the others"
         )
-    if fault.kind in _DOING:
-        return _DOING[fault.kind].format(value=fault.value or 0.0, unit=layout.unit)
+    if fault.kind.does:
+        return fault.kind.does.format(value=fault.value or 0.0, unit=layout.unit)
     if found.silent[fault.cells[0]]:
         return "delivers no reading"
     return f"reads {fault.value or 0.0:.4g} {layout.unit}"
@@ -85,16 +60,15 @@ def reason_of(fault: Fault, cause: Cause, found: CellFindings, layout: SensorLay
     )
     if fault.line is None:
         whatever = (
-            "" if fault.kind in _DOING or found.silent[fault.cells[0]] else ", whatever touches it"
+            "" if fault.kind.does or found.silent[fault.cells[0]] else ", whatever touches it"
         )
-        check = _CHECKS.get(fault.kind, "the cell and its traces for a short circuit")
         return (
             f"{layout.place(fault.cells[0])} {fault.kind.verb()}: it {does}{since}{whatever}"
-            f"{already}; check {check}"
+            f"{already}; check {fault.kind.check}"
         )
     inferred = len(cause.cells) - len(cause.seen)
     are = "is" if inferred == 1 else "are"
-    if fault.line.kind in ("position", "bus", "group"):
+    if fault.line.kind in DECLARED:
         silent = (
             "are silent"
             if found.silent[fault.cells[0]]

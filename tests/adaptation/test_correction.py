@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from adaptfault.adaptation.baselines.correction import STEP, CausalCorrection, correct
-from adaptfault.data.windows import Windows, make_windows
+from adaptfault.adaptation.baselines.correction import CausalCorrection, correct
+from adaptfault.data.windows import CONVERTER_STEP, Windows, make_windows
 from adaptfault.imputation.statistics import CellStatistics
 from diagnostics import FaultSet
 
@@ -39,8 +39,8 @@ def test_a_short_cell_corrected_is_an_open_cell_to_the_last_bit(rng):
 
 
 def test_one_converter_step_off_the_rail_is_still_abnormal_and_three_are_not():
-    near = np.float32([1 - STEP, 1 + STEP, 1 - 3 * STEP])
-    np.testing.assert_array_equal(correct(near), np.float32([0, 0, 1 - 3 * STEP]))
+    near = np.float32([1 - CONVERTER_STEP, 1 + CONVERTER_STEP, 1 - 3 * CONVERTER_STEP])
+    np.testing.assert_array_equal(correct(near), np.float32([0, 0, 1 - 3 * CONVERTER_STEP]))
     assert (correct(near, tolerance=0) == near).all()
 
 

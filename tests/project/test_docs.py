@@ -194,7 +194,7 @@ def test_the_tables_of_the_result_pages_are_what_was_measured(monkeypatch):
     import pages
 
     measured = pages.Measured.read()
-    texts = [page.read_text() for page in sorted(pages.PAGES.glob("results*.md"))]
+    texts = [page.read_text() for page in pages.with_tables()]
     named = pages.BLOCK.findall("".join(texts))
     assert sorted(named) == sorted(pages.TABLES)
     for text in texts:
@@ -218,6 +218,23 @@ def test_a_figure_without_counts_is_deleted_once_it_is_measured(monkeypatch):
     assert table[0] == "|  | split 0 | since, split 0 | ROW |"
     assert table[2] == "| recall | 0.250 | 0.500 | `cells` |"
     assert pages.drawn(pages.hand(pages.Measured([count], []))).count("since") == 0
+
+
+def test_a_table_of_other_figures_has_their_rows_and_columns(monkeypatch):
+    monkeypatch.syspath_prepend(HOME / "benchmarks")
+    import pages
+
+    others = [
+        {"row": "fill", "column": "10 %", "value": 0.68, "spread": 0.019},
+        {"row": "head", "column": "10 %", "value": 0.9, "best": 0.85, "by": "T"},
+        {"row": "head", "column": "time", "value": 7.0, "unit": "s"},
+    ]
+    others = [{"table": "repaired", **figure} for figure in others]
+    assert pages.TABLES["repaired"](pages.Measured([], [], others)) == [
+        ["", "10 %", "time"],
+        ["fill", "0.680 ± 0.019", "-"],
+        ["head", "0.900 / 0.850 T", "7 s"],
+    ]
 
 
 def test_the_page_of_formats_names_every_key_and_field_that_is_read(tmp_path):

@@ -26,11 +26,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from adaptfault.data.windows import CONVERTER_STEP
 from adaptfault.imputation.statistics import CellStatistics
 from diagnostics.preprocessing.array_likes import plain_array
 
-STEP = 1 / 4095  # of a 12-bit converter, as the paper's ESP32 has, on the 0..1 scale
-TOLERANCE = 1.5 * STEP  # a cell at the rail may vary by one converter step
+TOLERANCE = 1.5 * CONVERTER_STEP  # a cell at the rail may vary by one converter step
 
 Neutral = float | ArrayLike | CellStatistics
 

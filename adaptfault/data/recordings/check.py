@@ -32,7 +32,8 @@ def check_width(
             sensor.
     """
     if content.shape is not None and content.shape != layout.shape:
-        came, expected = (" x ".join(map(str, shape)) for shape in (content.shape, layout.shape))
+        came = " x ".join(map(str, content.shape))
+        expected = " x ".join(map(str, layout.shape))
         what = f"frames of {came} (pads x rows x cols) where the layout{stated} has {expected}"
         what += "; use recordings of the same sensor" if strict else f"; {GIVE_LAYOUT}"
         raise InputError.at(content.path, what)
@@ -204,7 +205,7 @@ def out_of_range(found: list[Problem], files: int, layout: SensorLayout) -> list
 
 def clamped_readings(clamped: NDArray[np.int64]) -> Problem:
     """Return the warning about readings below and above the tables, ``[2, D]``."""
-    below, above = (int(n) for n in clamped.sum(axis=1))
+    below, above = clamped.sum(axis=1).tolist()
     cells = int(clamped.any(axis=0).sum())
     what = (
         f"{below} readings below and {above} above the tables of {cells} cells, most on cell"

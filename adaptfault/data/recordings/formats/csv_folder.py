@@ -261,7 +261,8 @@ def _in_seconds(row: str, column: int, dialect: Dialect) -> str:
 
 def _is_cut(line: str, before: str, dialect: Dialect) -> bool:
     """Return whether a line stops short, compared with the line before it."""
-    cells, cells_before = (dialect.split(row) for row in (line, unquoted(before)))
+    cells = dialect.split(line)
+    cells_before = dialect.split(unquoted(before))
     last = cells[-1]
     stops = len(cells) < len(cells_before) or dialect.number(last) is None
     return stops and dialect.number(cells_before[-1]) is not None

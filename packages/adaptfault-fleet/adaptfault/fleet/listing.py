@@ -224,7 +224,8 @@ def _filled(text: str, values: Mapping[str, str]) -> str:
 
 def _name(bundle: str, pattern: str) -> str:
     """Return the text matched by the stars; with a ``**``, everything from the first star on."""
-    parts, stars = Path(bundle).parts, Path(pattern).parts
+    parts = Path(bundle).parts
+    stars = Path(pattern).parts
     if "**" in stars:
         kept = parts[next(i for i, part in enumerate(stars) if glob.has_magic(part)) :]
     else:

@@ -45,10 +45,8 @@ class Reproduce(Reading):
         from adaptfault.paper.settings import Settings
 
         if self.recordings:
-            recordings, source = (
-                self.load(self.recordings, labelled=True),
-                Path(self.recordings[0]).name,
-            )
+            recordings = self.load(self.recordings, labelled=True)
+            source = Path(self.recordings[0]).name
         if self.samples and min(self.samples) < 1:
             raise ValueError(
                 f"--samples {min(self.samples)}: fault-aware training adds 1 window or more"

@@ -254,11 +254,12 @@ class AgeingReport:
         span, every = (30, "30 days") if self.unit == "day" else (1, "run")
         rates = [span * rate for rate in (trend.rate, trend.rate_low, trend.rate_high)]
         if series.statistic == "gain":
-            rate, low, high = (f"{100 * np.expm1(r):+.2g}%" for r in rates)
+            told = [f"{100 * np.expm1(r):+.2g}%" for r in rates]
         elif series.statistic in ("offset", "noise"):
-            rate, low, high = (f"{100 * r:+.2g}% of full scale" for r in rates)
+            told = [f"{100 * r:+.2g}% of full scale" for r in rates]
         else:
-            rate, low, high = (f"{r:+.2g}" for r in rates)
+            told = [f"{r:+.2g}" for r in rates]
+        rate, low, high = told
         now = series.value(trend.now)
         text = (
             f"{series.place(layout)}: {series.statistic} {now:.3g}, {rate} per {every} ({low} to"

@@ -227,9 +227,8 @@ def _by_robot(life: Lifetimes, shape: float, scale: float) -> tuple[Floats, Floa
     """Return the expected and the observed number of faults of each robot, ``[robots]`` each."""
     expected = life.units * ((life.end / scale) ** shape - (life.entry / scale) ** shape)
     robots = int(life.robot.max()) + 1
-    of, faults = (
-        np.bincount(life.robot, number, robots) for number in (expected, life.units * life.failed)
-    )
+    of = np.bincount(life.robot, expected, robots)
+    faults = np.bincount(life.robot, life.units * life.failed, robots)
     return of.astype(np.float64), faults.astype(np.float64)
 
 

@@ -248,7 +248,8 @@ class Session:
         self._classified += 1
         if self._classified % CONFIRMED_AFTER == 0 and not self._confirmed:
             events += self._confirm()
-        decided, probabilities = reading.label, reading.probabilities
+        decided = reading.label
+        probabilities = reading.probabilities
         if self.accumulate:
             probabilities = getattr(reading, "contact", None)
             decided = None if probabilities is None else int(np.argmax(probabilities))

@@ -17,6 +17,7 @@ import numpy as np
 
 from diagnostics import Diagnosis, Fault, Line, SensorLayout
 from diagnostics.decision.coverage import percent
+from diagnostics.wiring import DECLARED
 
 TOPIC = "/diagnostics"
 
@@ -31,7 +32,6 @@ _GROUPS = {
     "addresses": ("row_address", "column_address"),
     "converter": ("converter",),
 }
-_DECLARED: dict[str, tuple[str, ...]] = {"groups": ("position", "bus", "group")}
 
 
 class Level(IntEnum):
@@ -130,7 +130,7 @@ def write_diagnostics(
 
 
 def _groups(layout: SensorLayout) -> dict[str, tuple[str, ...]]:
-    return _GROUPS if layout.is_matrix else _DECLARED
+    return _GROUPS if layout.is_matrix else {"groups": DECLARED}
 
 
 def _pad(diagnosis: Diagnosis, pad: int, faults: list[Fault]) -> dict[str, Any]:

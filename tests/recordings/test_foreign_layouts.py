@@ -3,6 +3,7 @@ insoles, taxels of three axes, tables of grasps."""
 
 import re
 
+import h5py
 import numpy as np
 import pytest
 import scipy.io
@@ -12,6 +13,7 @@ from recording_files import refusal
 
 from adaptfault.data.recordings import load
 from adaptfault.data.recordings.facts.roles import axes_of, shape_of, sizes_of
+from adaptfault.data.recordings.formats.datasets.features import is_touch
 
 T = 30
 rng = np.random.default_rng(0)
@@ -197,3 +199,31 @@ def test_an_array_of_structures_with_many_times_each_holds_recordings(tmp_path):
         held[0, i] = (times(), rng.uniform(0, 5, (T, 4, 4)))
     scipy.io.savemat(tmp_path / "grasps.mat", {"trials": held})
     assert len(load(tmp_path / "grasps.mat").recordings.frames) == 12
+
+
+FINGERS = ("thumb", "index", "middle", "ring")
+
+
+@pytest.mark.parametrize(
+    "name", ["observations/{}_tactile", "{}/tactile", "tactile/{}", "tactile.{}", "{}_finger_skin"]
+)
+@pytest.mark.parametrize("key", [False, True])
+def test_the_index_finger_is_no_counter(name, key, tmp_path):
+    names = [name.format(finger) for finger in FINGERS]
+    frames = {one: counts(24).reshape(T, 4, 6) for one in names}
+    with h5py.File(tmp_path / "hand.h5", "w") as file:
+        for one, readings in frames.items():
+            file[one] = readings
+        file["frame_index"] = np.arange(T)
+        file["tactile_frame_index"] = np.arange(T)
+    loaded = load(tmp_path / "hand.h5", key=name.format("*") if key else None)
+    assert loaded.recordings.layout.shape == (4, 4, 6)
+    (read,) = loaded.recordings.frames
+    in_order = [frames[one] for one in sorted(names)]
+    np.testing.assert_array_equal(read.reshape(T, 4, 4, 6), np.stack(in_order, axis=1))
+
+
+def test_the_index_finger_has_a_topic_as_the_others_have():
+    assert all(is_touch(f"/hand/{finger}/tactile") for finger in FINGERS)
+    assert not is_touch("tactile_frame_index")
+    assert not is_touch("taxel_index")

@@ -5,6 +5,8 @@ import re
 
 import h5py
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 import scipy.io
 from hypothesis import given
@@ -227,3 +229,31 @@ def test_the_index_finger_has_a_topic_as_the_others_have():
     assert all(is_touch(f"/hand/{finger}/tactile") for finger in FINGERS)
     assert not is_touch("tactile_frame_index")
     assert not is_touch("taxel_index")
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".parquet"])
+@pytest.mark.parametrize("number", ["grasp_id", "trial", "episode_id", "demo_id"])
+def test_a_table_whose_rows_are_each_another_grasp_is_refused_with_the_reason(
+    suffix, number, tmp_path
+):
+    columns = {number: np.arange(T), "success": counts(1)[:, 0] % 2}
+    columns |= {f"{f}_{i}": counts(1)[:, 0] for f in FINGERS for i in range(12)}
+    path = tmp_path / f"grasps{suffix}"
+    if suffix == ".csv":
+        table(path, columns)
+    else:
+        pq.write_table(pa.table(columns), path)
+    message = refusal(path)
+    assert "another" in message
+    assert "nothing tells how a cell moves" in message
+
+
+@pytest.mark.parametrize("number", ["grasp_id", "trial_id", "demo_id"])
+def test_a_recording_begins_with_each_grasp(number, tmp_path):
+    columns = {number: np.repeat([7, 8, 9], T // 3)}
+    columns |= {f"cell_r{i // 4}_c{i % 4}": counts(1)[:, 0] for i in range(12)}
+    recordings = load(table(tmp_path / "grasps.csv", columns)).recordings
+    assert [len(frames) for frames in recordings.frames] == [T // 3] * 3
+    assert [name.rpartition(", ")[2] for name in recordings.names] == [
+        f"episode {i}" for i in (7, 8, 9)
+    ]

@@ -11,7 +11,10 @@ from pathlib import Path
 from adaptfault.data.recordings.errors import InputError
 from adaptfault.data.recordings.recording import Shape
 
-EPISODES = ("episode_index", "episode", "episode_id", "recording", "trial")
+EPISODES = (
+    *("episode_index", "episode", "episode_id", "recording", "trial"),
+    *("recording_id", "trial_id", "demo_id", "grasp_id"),
+)
 """Names of what numbers the episodes, in the order of preference."""
 
 LABELS = ("label", "labels", "class", "object", "task")

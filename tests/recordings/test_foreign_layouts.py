@@ -1,6 +1,7 @@
 """Layouts that other people's files show by names, structures and lists: gloves, fingertips,
 insoles, taxels of three axes, tables of grasps."""
 
+import json
 import re
 
 import h5py
@@ -257,3 +258,35 @@ def test_a_recording_begins_with_each_grasp(number, tmp_path):
     assert [name.rpartition(", ")[2] for name in recordings.names] == [
         f"episode {i}" for i in (7, 8, 9)
     ]
+
+
+def test_the_shapes_that_are_named_for_pads_that_differ_in_size_can_be_stated(tmp_path):
+    columns = {"Time(s)": times()}
+    sizes = {"Thumb": 9, "Index": 12, "Palm": 25}
+    columns |= {f"{pad}_P{i + 1}": counts(1)[:, 0] for pad, n in sizes.items() for i in range(n)}
+    path = table(tmp_path / "glove.csv", columns)
+    loaded = load(path)
+    (told,) = [one.message for one in loaded.problems if "give --shape" in one.message]
+    named = re.findall(r"\d+x\d+x\d+", told)
+    assert named
+    for shape in named:
+        stated = load(path, shape=shape)
+        assert not [one for one in stated.problems if "--shape" in one.message]
+        np.testing.assert_array_equal(stated.recordings.frames[0], loaded.recordings.frames[0])
+
+
+def test_objects_in_json_lines_are_fields(tmp_path):
+    readings = counts(32).reshape(T, 2, 4, 4)
+    lines = [
+        {
+            "header": {"stamp": t * 0.02},
+            "hand": {"skin": {"index": a.tolist(), "thumb": b.tolist()}},
+        }
+        for t, (a, b) in enumerate(readings)
+    ]
+    path = tmp_path / "log.jsonl"
+    path.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    recordings = load(path).recordings
+    assert recordings.layout.shape == (2, 4, 4)
+    assert recordings.layout.rate == 50
+    np.testing.assert_array_equal(recordings.frames[0], readings.reshape(T, 32))

@@ -33,7 +33,9 @@ _ALONE = ("seconds", "secs", "millis", "milliseconds", "micros", "microseconds")
 """Units that name times by themselves."""
 
 _UNIT = rf"[\[(]?({'|'.join(_UNITS)})[\])]?"
-_WORDS = "time[_ ]?stamps?|times?|stamps?|clock|epoch|elapsed|zeit|uhrzeit"
+_WORDS = (
+    "time[_ ]?stamps?|times?|stamps?|clock|epoch|elapsed|zeit|uhrzeit|unix(?:time)?|utc|datetime"
+)
 _CLOCK = re.compile(
     rf"[%#]?(?:rosbag[_ ]?)?_*(?:{_WORDS}|ts|t)(?:[_ ]?{_UNIT})?", re.IGNORECASE | re.ASCII
 )

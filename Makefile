@@ -72,7 +72,7 @@ wheel-check: .venv/installed-dev
 lerobot-check:
 	test -e build/lerobot/bin/python || $(PYTHON) -m venv build/lerobot
 	build/lerobot/bin/python -m pip install --quiet --disable-pip-version-check '.[datasets]' \
-		./packages/adaptfault-station './packages/lerobot_policy_adaptfault[lerobot]'
+		./packages/adaptfault-viewers ./packages/adaptfault-station './packages/lerobot_policy_adaptfault[lerobot]'
 	build/lerobot/bin/python tests/check_lerobot.py
 	build/lerobot/bin/python tests/check_touch_step.py
 

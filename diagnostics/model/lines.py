@@ -208,7 +208,10 @@ class Lines:
         log = observed.log
         of = self.on & eligible
         rests = self.means(log.load, of) <= NOTHING
-        expected = self.expected(observed.predictor.mean, log.load, known, of)
+        expected = observed.once(
+            ("expected of lines", known.tobytes(), of.tobytes()),
+            lambda: self.expected(observed.predictor.mean, log.load, known, of),
+        )
         context = self.contexts(expected, rests, log.load, log.record.first, known)
         half = self.half if len(self.half) else np.zeros(len(context), np.intp)
         resting = self.resting[half[:, None], np.arange(len(self.on)), context]

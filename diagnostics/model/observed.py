@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Hashable
 from functools import cached_property
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +30,8 @@ _ODD = 8.0  # nats of a unit beyond those expected
 # of a held value without and with dither
 _LOOKS = np.log([[0.99, 0.007, 0.003], [0.1, 0.88, 0.02]])
 _USUALLY = 8.0  # cells that the usual look of a piece is worth
+
+Kept = TypeVar("Kept")
 
 
 class Log:
@@ -223,13 +226,14 @@ class Observed:
         usual = flatness.of_others(self.group, activity, log.flat)
         self.of_flatness = self._shared(usual)
         self.alone = log.alone(predictor)
-        self._kept: dict[Hashable, Array] = {}
+        self._kept: dict[Hashable, Any] = {}
 
-    def once(self, name: Hashable, found: Callable[[], Array]) -> Array:
+    def once(self, name: Hashable, found: Callable[[], Kept]) -> Kept:
         """Return what is ``found`` of a log by these cells, which is asked once."""
         if name not in self._kept:
             self._kept[name] = found()
-        return self._kept[name]
+        kept: Kept = self._kept[name]
+        return kept
 
     def _unwitnessed(self) -> Mask:
         """Return where nobody tells of a contact, bool ``[n, D]``.

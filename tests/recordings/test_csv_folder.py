@@ -319,6 +319,15 @@ def test_no_function_is_called_for_each_number_of_a_file(tmp_path):
     assert calls < 0.3 * 10 * 100 * 220
 
 
+@pytest.mark.parametrize("header", ["unix_ms", "unixtime", "UTC [ms]", "DateTime (ms)", "millis"])
+def test_times_are_told_by_their_name_wherever_they_stand(tmp_path, header):
+    rows = [f"{i % 7},{i % 5},{1_700_000_000_000 + 50 * i}" for i in range(50)]
+    file = write(tmp_path / "a.csv", "\n".join([f"c0,c1,{header}", *rows]) + "\n")
+    loaded = load(file, shape="1x2", full_scale=7, unit="count")
+    assert loaded.recordings.layout.rate == 20
+    assert not loaded.problems
+
+
 @pytest.mark.parametrize(
     ("header", "times", "rate"),
     [

@@ -1,9 +1,13 @@
 """Layouts that other people's files show by names, structures and lists: gloves, fingertips,
 insoles, taxels of three axes, tables of grasps."""
 
+import json
 import re
 
+import h5py
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 import scipy.io
 from hypothesis import given
@@ -12,6 +16,7 @@ from recording_files import refusal
 
 from adaptfault.data.recordings import load
 from adaptfault.data.recordings.facts.roles import axes_of, shape_of, sizes_of
+from adaptfault.data.recordings.formats.datasets.features import is_touch
 
 T = 30
 rng = np.random.default_rng(0)
@@ -197,3 +202,91 @@ def test_an_array_of_structures_with_many_times_each_holds_recordings(tmp_path):
         held[0, i] = (times(), rng.uniform(0, 5, (T, 4, 4)))
     scipy.io.savemat(tmp_path / "grasps.mat", {"trials": held})
     assert len(load(tmp_path / "grasps.mat").recordings.frames) == 12
+
+
+FINGERS = ("thumb", "index", "middle", "ring")
+
+
+@pytest.mark.parametrize(
+    "name", ["observations/{}_tactile", "{}/tactile", "tactile/{}", "tactile.{}", "{}_finger_skin"]
+)
+@pytest.mark.parametrize("key", [False, True])
+def test_the_index_finger_is_no_counter(name, key, tmp_path):
+    names = [name.format(finger) for finger in FINGERS]
+    frames = {one: counts(24).reshape(T, 4, 6) for one in names}
+    with h5py.File(tmp_path / "hand.h5", "w") as file:
+        for one, readings in frames.items():
+            file[one] = readings
+        file["frame_index"] = np.arange(T)
+        file["tactile_frame_index"] = np.arange(T)
+    loaded = load(tmp_path / "hand.h5", key=name.format("*") if key else None)
+    assert loaded.recordings.layout.shape == (4, 4, 6)
+    (read,) = loaded.recordings.frames
+    in_order = [frames[one] for one in sorted(names)]
+    np.testing.assert_array_equal(read.reshape(T, 4, 4, 6), np.stack(in_order, axis=1))
+
+
+def test_the_index_finger_has_a_topic_as_the_others_have():
+    assert all(is_touch(f"/hand/{finger}/tactile") for finger in FINGERS)
+    assert not is_touch("tactile_frame_index")
+    assert not is_touch("taxel_index")
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".parquet"])
+@pytest.mark.parametrize("number", ["grasp_id", "trial", "episode_id", "demo_id"])
+def test_a_table_whose_rows_are_each_another_grasp_is_refused_with_the_reason(
+    suffix, number, tmp_path
+):
+    columns = {number: np.arange(T), "success": counts(1)[:, 0] % 2}
+    columns |= {f"{f}_{i}": counts(1)[:, 0] for f in FINGERS for i in range(12)}
+    path = tmp_path / f"grasps{suffix}"
+    if suffix == ".csv":
+        table(path, columns)
+    else:
+        pq.write_table(pa.table(columns), path)
+    message = refusal(path)
+    assert "another" in message
+    assert "nothing tells how a cell moves" in message
+
+
+@pytest.mark.parametrize("number", ["grasp_id", "trial_id", "demo_id"])
+def test_a_recording_begins_with_each_grasp(number, tmp_path):
+    columns = {number: np.repeat([7, 8, 9], T // 3)}
+    columns |= {f"cell_r{i // 4}_c{i % 4}": counts(1)[:, 0] for i in range(12)}
+    recordings = load(table(tmp_path / "grasps.csv", columns)).recordings
+    assert [len(frames) for frames in recordings.frames] == [T // 3] * 3
+    assert [name.rpartition(", ")[2] for name in recordings.names] == [
+        f"episode {i}" for i in (7, 8, 9)
+    ]
+
+
+def test_the_shapes_that_are_named_for_pads_that_differ_in_size_can_be_stated(tmp_path):
+    columns = {"Time(s)": times()}
+    sizes = {"Thumb": 9, "Index": 12, "Palm": 25}
+    columns |= {f"{pad}_P{i + 1}": counts(1)[:, 0] for pad, n in sizes.items() for i in range(n)}
+    path = table(tmp_path / "glove.csv", columns)
+    loaded = load(path)
+    (told,) = [one.message for one in loaded.problems if "give --shape" in one.message]
+    named = re.findall(r"\d+x\d+x\d+", told)
+    assert named
+    for shape in named:
+        stated = load(path, shape=shape)
+        assert not [one for one in stated.problems if "--shape" in one.message]
+        np.testing.assert_array_equal(stated.recordings.frames[0], loaded.recordings.frames[0])
+
+
+def test_objects_in_json_lines_are_fields(tmp_path):
+    readings = counts(32).reshape(T, 2, 4, 4)
+    lines = [
+        {
+            "header": {"stamp": t * 0.02},
+            "hand": {"skin": {"index": a.tolist(), "thumb": b.tolist()}},
+        }
+        for t, (a, b) in enumerate(readings)
+    ]
+    path = tmp_path / "log.jsonl"
+    path.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    recordings = load(path).recordings
+    assert recordings.layout.shape == (2, 4, 4)
+    assert recordings.layout.rate == 50
+    np.testing.assert_array_equal(recordings.frames[0], readings.reshape(T, 32))

@@ -12,9 +12,12 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+from adaptfault.data.recordings.errors import InputError
 
 SHORTEST = 10
 """Frames of a window: a class that mostly holds for as many is that of a recording."""
@@ -64,6 +67,17 @@ def numbered(numbers: Sequence[Any]) -> list[Episode]:
     """Return the episodes of frames with the number of theirs."""
     begins = [0, *(i for i in range(1, len(numbers)) if numbers[i] != numbers[i - 1])]
     return [Episode(a, b, numbers[a]) for a, b in pairwise([*begins, len(numbers)])]
+
+
+def refuse_a_row_each(path: Path, episodes: Sequence[Episode]) -> None:
+    """Raise InputError where each of several episodes of a table (``path``) is a single row."""
+    if len(episodes) > 1 and all(one.last - one.first == 1 for one in episodes):
+        what = (
+            f"each row is another recording, {episodes[0].name} to {episodes[-1].name}: values of a"
+            " whole grasp or step and no frames, so nothing tells how a cell moves; give the"
+            " recordings themselves"
+        )
+        raise InputError.at(path, what)
 
 
 def divide(episodes: Sequence[Episode], classes: Sequence[Any]) -> Division:

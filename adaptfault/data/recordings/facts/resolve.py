@@ -200,10 +200,16 @@ def _without_rows(contents: Sequence[Content], shape: Shape) -> list[Problem]:
         return []
     pads, _, cells = shape
     cells //= told[0].facts.declared.get("axes", 1)
+    rows = f"give --shape {pads}x{sides(cells)}, or {pads}x1x{cells} if they have none"
+    if told[0].facts.present is not None:  # they differ in size
+        rows = (
+            "number rows and columns in the names of the columns, as palm_r0_c0, or give --shape"
+            f" {pads}x1x{cells} if they have none"
+        )
     what = (
         f"{told[0].facts.shape_reason}, and nothing states their rows and columns: taken as {pads}"
         f" pad{'s' * (pads > 1)} without rows, so that a broken row or column shows as single"
-        f" cells; give --shape {pads}x{sides(cells)}, or {pads}x1x{cells} if they have none"
+        f" cells; {rows}"
     )
     return [Problem.warning(told[0].path, what)]
 

@@ -11,7 +11,10 @@ from pathlib import Path
 from adaptfault.data.recordings.errors import InputError
 from adaptfault.data.recordings.recording import Shape
 
-EPISODES = ("episode_index", "episode", "episode_id", "recording", "trial")
+EPISODES = (
+    *("episode_index", "episode", "episode_id", "recording", "trial"),
+    *("recording_id", "trial_id", "demo_id", "grasp_id"),
+)
 """Names of what numbers the episodes, in the order of preference."""
 
 LABELS = ("label", "labels", "class", "object", "task")
@@ -30,7 +33,9 @@ _ALONE = ("seconds", "secs", "millis", "milliseconds", "micros", "microseconds")
 """Units that name times by themselves."""
 
 _UNIT = rf"[\[(]?({'|'.join(_UNITS)})[\])]?"
-_WORDS = "time[_ ]?stamps?|times?|stamps?|clock|epoch|elapsed|zeit|uhrzeit"
+_WORDS = (
+    "time[_ ]?stamps?|times?|stamps?|clock|epoch|elapsed|zeit|uhrzeit|unix(?:time)?|utc|datetime"
+)
 _CLOCK = re.compile(
     rf"[%#]?(?:rosbag[_ ]?)?_*(?:{_WORDS}|ts|t)(?:[_ ]?{_UNIT})?", re.IGNORECASE | re.ASCII
 )

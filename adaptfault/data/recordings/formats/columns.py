@@ -196,11 +196,13 @@ def _shown(
     shown = None if shape else shape_of(names)
     if shown is not None:
         return *shown, None
-    unequal = None if shape else sizes_of(names)
+    unequal = sizes_of(names) if shape is None or math.prod(shape) != len(names) else None
     if unequal is None:
         return None, "", None
     pads = Pads.of(unequal[0])
-    return pads.shape, unequal[1], pads
+    if shape is None:
+        return pads.shape, unequal[1], pads
+    return (shape, "", pads) if pads.shape == shape else (None, "", None)
 
 
 def _refuse_summaries(path: Path, names: Sequence[str]) -> None:

@@ -10,7 +10,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from adaptfault.data.recordings.errors import InputError
-from adaptfault.data.recordings.facts.episodes import Division, Episode, divide
+from adaptfault.data.recordings.facts.episodes import (
+    Division,
+    Episode,
+    divide,
+    refuse_a_row_each,
+)
 from adaptfault.data.recordings.facts.episodes import numbered as by_number
 from adaptfault.data.recordings.formats.columns import Columns
 from adaptfault.data.recordings.formats.dialect import Dialect, bare, is_comment, unquoted
@@ -43,7 +48,7 @@ def spans_of(path: Path, dialect: Dialect, columns: Columns) -> tuple[list[Span]
     """Return the recordings of a file, and how they were divided.
 
     Raises:
-        InputError: the column of classes is empty.
+        InputError: the column of classes is empty, or each row is another episode.
     """
     if columns.episode is None and columns.label is None:
         return [Span()], Division(())
@@ -60,6 +65,7 @@ def spans_of(path: Path, dialect: Dialect, columns: Columns) -> tuple[list[Span]
         what = f"column {columns.label} is empty; --label-column names the class"
         raise InputError.at(path, what)
     episodes = by_number(numbers) if numbers else [Episode(0, len(places))]
+    refuse_a_row_each(path, episodes)
     division = divide(episodes, classes) if classes else Division(tuple(episodes))
     begins = [places[episode.first] for episode in division.episodes]
     ends = [*(begin for _, begin in begins[1:]), None]

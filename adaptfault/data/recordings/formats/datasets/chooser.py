@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adaptfault.data.recordings.errors import InputError, Problem
-from adaptfault.data.recordings.facts.episodes import Division, Episode
+from adaptfault.data.recordings.facts.episodes import Division, Episode, refuse_a_row_each
 from adaptfault.data.recordings.facts.labels import natural_key
 from adaptfault.data.recordings.facts.roles import (
     COUNTERS,
@@ -330,6 +330,8 @@ class Chooser:
                     self.lost.append(f"{what} are left out")
             elif column is not None and not group:
                 found = self._runs(column, written)
+                if self.contents.is_table:
+                    refuse_a_row_each(self.path, found)
             else:
                 found = [Episode(0, written)]
             is_group = len(found) == 1 and found[0].number is None

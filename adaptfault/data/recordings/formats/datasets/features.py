@@ -28,8 +28,11 @@ from adaptfault.data.recordings.recording import Shape
 VALID = ".valid"
 """What the name of a mask has behind that of the array whose valid readings it tells."""
 
+# an index counts what is named before it; else it is a finger
 _NO_TOUCH = re.compile(
-    r"temp|time|stamp|valid|mask|index|image|rgb|depth|video|calib", re.IGNORECASE
+    r"temp|time|stamp|valid|mask|image|rgb|depth|video|calib|^index$|indices"
+    r"|(?:frame|sample|episode|task|row|step|taxel|cell|electrode|channel)[_ -]?index",
+    re.IGNORECASE,
 )
 _VERSION = re.compile(r"raw|filter|smooth|normali|scaled|baseline|diff|mean|std", re.IGNORECASE)
 _EPISODE = re.compile(

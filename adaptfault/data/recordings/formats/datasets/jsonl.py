@@ -1,6 +1,7 @@
 """Opens JSON lines: an object a line with a list of readings, or the list alone; one frame a line.
 
-``null`` is a missing reading. A last line that was cut off is left out with a warning.
+The values of an object in it are fields behind its name, as ``hand.index``. ``null`` is a missing
+reading. A last line that was cut off is left out with a warning.
 """
 
 from __future__ import annotations
@@ -73,7 +74,20 @@ def _parsed(path: Path, file: Any, told: list[str]) -> Iterator[tuple[int, int, 
         if not isinstance(line, dict):
             what = "expected an object or a list of readings"
             raise InputError.at(path, what, f"line {number}")
-        yield number, begin, line
+        yield number, begin, _flat(line)
+
+
+def _flat(line: dict[str, Any]) -> dict[str, Any]:
+    """Return the values of a line; those of an object in it behind its name, as ``hand.index``."""
+    if not any(isinstance(value, dict) for value in line.values()):
+        return line
+    found: dict[str, Any] = {}
+    for name, value in line.items():
+        if isinstance(value, dict):
+            found |= {f"{name}.{inner}": one for inner, one in _flat(value).items()}
+        else:
+            found[name] = value
+    return found
 
 
 class _Lines:

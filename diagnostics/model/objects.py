@@ -103,9 +103,7 @@ def find_objects(
     touched = log.load[:, judgement.known & ~holds] > NOTHING
     if not touched.any():  # all that is loaded may be one contact
         return []
-    near = blamed
-    if known:
-        near = layout.with_neighbours(blamed)
+    near = layout.with_neighbours(blamed)
     resting = model.predictor.on_pad((judgement.known & ~holds).astype(np.float32))
     number = layout.connected(holds & (resting > 0))
     every = [number == i for i in range(1, number.max() + 1)]

@@ -86,7 +86,7 @@ class Log:
         self.holds = (record.low >= low) & (record.high <= high)
         doubt = np.where(wider, unsure, rest.near / 2)
         shifts = [np.zeros_like(doubt), -doubt, doubt]
-        if wider.any():
+        if self.step or wider.any():
             shifts += [-doubt / 2, doubt / 2]
         # an offset that the reference never saw: a cell may share none of it, or sink by half
         uneven = np.where(shared.unseen, (1 + EVEN) * np.maximum(shared.offset, 0), 0)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from pressed_recordings import presses as presses_of_pressed
 
 from diagnostics import FaultKind, SelfDiagnosis, SensorLayout, Verdict
 from diagnostics.model.objects import HeldLoads
@@ -83,6 +84,21 @@ def test_an_object_is_told_with_its_cells_and_nobody_is_blamed(fitted, log, sinc
     assert {diagnosis.verdicts[cell] for cell in UNDER} == {Verdict.UNTESTED}
     assert diagnosis.probability[list(UNDER)].max() < 0.1
     assert "something lies still" in str(diagnosis)
+
+
+@pytest.mark.parametrize(
+    ("seed", "since", "row", "column"), [(1, 0, 2, 2), (2, 0, 1, 2), (4, 15, 1, 1), (14, 15, 2, 2)]
+)
+def test_an_object_on_much_of_a_pad_is_told_though_lines_beside_it_looked_broken(
+    pressed, seed, since, row, column
+):
+    rng = np.random.default_rng(seed)
+    under = np.arange(64).reshape(8, 8)[row : row + 5, column : column + 5].ravel()
+    loads = rng.uniform(200, 900, len(under)).round()
+    log = with_loads(presses_of_pressed(seed, 40), under.tolist(), loads, since)
+    diagnosis = pressed.diagnose(log)
+    assert not diagnosis.faults
+    assert {cell for load in diagnosis.static_loads for cell in load.cells} >= {*under.tolist()}
 
 
 def test_cells_that_are_stuck_beside_an_object_are_found(fitted, log):

@@ -328,6 +328,7 @@ def _judge_logs(
     a long log always looks faulty, and misleads the others once it is left out.
     """
     cells = np.flatnonzero(model.living)
+    of_objects = np.random.default_rng(1)
     reached = _Reached.of(model)
     of_lines = np.zeros(len(model.lines.on), np.float32)
     of_groups = np.zeros(len(model.groups.odd), np.float32)
@@ -353,7 +354,7 @@ def _judge_logs(
         if not told:
             reached.bound(model)
         judgement = model.judge_record(record, healthy=healthy if told else None)
-        of_lines = np.maximum(of_lines, _of_healthy_lines(model, judgement, rng))
+        of_lines = np.maximum(of_lines, _of_healthy_lines(model, judgement, rng, of_objects))
         moving = judgement.observed.log.far & model.living
         of_group, _ = model.groups.evidence(judgement.observed.log, moving)
         of_groups = np.maximum(of_groups, of_group)
@@ -410,15 +411,17 @@ class _Reached:
         model.reached = np.maximum.accumulate(self.units)
 
 
-def _of_healthy_lines(model: Model, judgement: Judgement, rng: np.random.Generator) -> Array:
+def _of_healthy_lines(
+    model: Model, judgement: Judgement, rng: np.random.Generator, of_objects: np.random.Generator
+) -> Array:
     """Return the evidence of each line ``[W]`` in a log without broken ones, with a line beside it
-    that is left out, and with cells that an object lies on."""
+    that is left out, and with cells that an object lies on; each generator draws where."""
     observed = judgement.observed
     moving = model.moving(observed.log)
     found = np.zeros(len(model.lines.on), np.float32)
     if len(found):
         out = model.lines.on[rng.integers(len(found))]
-        under = _around(model, int(rng.choice(np.flatnonzero(model.living))))
+        under = _around(model, int(of_objects.choice(np.flatnonzero(model.living))))
         for free in (np.ones_like(out), ~out, ~under):
             known = observed.known & free
             evidence = model.lines.evidence(observed, known, moving & free)

@@ -10,7 +10,9 @@ from diagnostics.model.record import Array, Cells, Mask, Record, since_begin
 
 EVEN = 0.5  # of an offset: by which the cells that share it differ
 NOISES = 3.0
-AROUND = 7  # blocks that tell where a cell rests, at least
+AROUND = 7  # blocks that tell where a cell rests
+FEWEST_AROUND = 4  # of them, at least
+NEARLY_ALL = 0.75  # of so few
 _HALF = 0.25  # of a positive offset, which a contact is as well; and by no more than some noises
 
 
@@ -47,7 +49,7 @@ def _narrow(width: Array, limit: Array | float) -> Array:
 
 def around(shared: Array, sure: Mask, record: Record) -> Array:
     """Return what a pad ``shared`` (``[n]``) before or after each piece in its recording, where it
-    is ``sure`` (bool ``[n]``), whichever is less; NaN: nowhere."""
+    is ``sure`` (bool ``[n]``), whichever is less; 0: nowhere."""
     n = len(shared)
     step = np.arange(n)
     begin = step - since_begin(record.first)
@@ -56,31 +58,8 @@ def around(shared: Array, sure: Mask, record: Record) -> Array:
     end = _next(np.append(record.first[1:], True))
     coming = _next(sure)
     after = np.where(coming <= end, shared[np.minimum(coming, n - 1)], np.inf)
-    less = _less(before, after)
-    found: Array = np.where(np.isinf(less), np.float32(np.nan), less)
-    return found
-
-
-def recordings_around(shared: Array, sure: Mask, record: Record) -> Array:
-    """Return the least of what a pad ``shared`` in the recording before or after that of each piece
-    in which it is ``sure``, ``[n]``; 0: in none."""
-    first = np.flatnonzero(record.first)
-    lowest = np.minimum.reduceat(np.where(sure, shared, np.inf), first)
-    highest = np.maximum.reduceat(np.where(sure, shared, -np.inf), first)
-    tells = np.isfinite(lowest)
-    least = np.append(np.clip(0, lowest, highest), np.inf)  # the last one stands for none
-    number = np.arange(len(first))
-    before = least[np.maximum.accumulate(np.where(tells, number, -1))]
-    after = least[_next(tells)]
-    less = _less(before, after)
-    of_recording = np.where(np.isinf(less), 0, less)
-    found: Array = np.repeat(of_recording, np.diff(np.append(first, len(shared))))
-    return found
-
-
-def _less(one: Array, other: Array) -> Array:
-    """Return whichever is smaller in size."""
-    found: Array = np.where(np.abs(one) <= np.abs(other), one, other)
+    less = np.where(np.abs(before) <= np.abs(after), before, after)
+    found: Array = np.where(np.isinf(less), 0, less)
     return found
 
 
@@ -104,7 +83,12 @@ def _next(on: Mask) -> Cells:
 
 def agreed(values: Array, limit: Array) -> tuple[Array, Mask]:
     """Return what most of the blocks around each one agree on, ``[blocks, k]``, and whether they
-    do: they differ by less than the ``limit`` ``[k]``."""
+    do: they differ by less than the ``limit`` ``[k]``. Few blocks are all around each other, and
+    nearly all of them have to agree."""
+    if len(values) < AROUND:
+        middle, width = shortest(values.T, NEARLY_ALL)
+        every = np.broadcast_to(middle, values.shape).astype(np.float32)
+        return every, np.broadcast_to(width <= limit, values.shape).copy()
     half = AROUND // 2
     mirrored = np.pad(values, ((half, half), (0, 0)), mode="reflect")
     windows = sliding_window_view(mirrored, 2 * half + 1, axis=0)

@@ -103,7 +103,8 @@ def find_objects(
     touched = log.load[:, judgement.known & ~holds] > NOTHING
     if not touched.any():  # all that is loaded may be one contact
         return []
-    near = layout.with_neighbours(blamed)
+    # a line beside an object looks broken: contacts do not load it as the reference's did
+    near = blamed | layout.with_neighbours(judgement.failing.cells | _cells_of(known, layout))
     resting = model.predictor.on_pad((judgement.known & ~holds).astype(np.float32))
     number = layout.connected(holds & (resting > 0))
     every = [number == i for i in range(1, number.max() + 1)]

@@ -67,15 +67,16 @@ class Log:
         self.above = rest.above(record, shared.offset)
         self.sunk: Mask = (shared.offset < 0) & (rest.level + shared.offset <= rest.near)
         noise = rest.noise_of(record, self.above, telling)
-        unsure, self.step = rest.unsure(record, noise, shared.drift, telling)
+        unsure, self.step = rest.unsure(record, noise, shared, telling)
         wider = unsure > rest.near
         self.saturated = rest.saturates(record, self.above, telling & self.far)
         self.disturbed: Mask = shared.unseen | rest.noisier(noise)
         if self.is_coarse:
             self.disturbed = np.ones_like(self.disturbed)
-        # a cell that stays about its rest rests, wherever that is by now
-        stays = np.fmax.reduce(record.mean) - np.fmin.reduce(record.mean) <= DITHER * rest.full
-        about = np.where(stays, DITHER * rest.full, np.where(wider, unsure, 0))
+        # on a pad that nothing touches a cell rests that stays about its rest, wherever that is
+        moves = np.fmax.reduce(record.mean) - np.fmin.reduce(record.mean) > DITHER * rest.full
+        untouched = ~np.isin(rest.pad, rest.pad[moves & telling])
+        about = np.where(untouched & living, DITHER * rest.full, np.where(wider, unsure, 0))
         self.above = np.where(np.abs(self.above) <= about, 0, self.above)
         self.value = _held(record.mean, DITHER * rest.full)
         # beyond the range of the reference every reading is the top

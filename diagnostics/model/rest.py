@@ -19,7 +19,8 @@ it is none: d is what the lowest readings of most recordings around agree on. Wh
 read in larger steps, than the reference rests within a wider range.
 
 Not detected: an offset of a pad with few cells; one that comes with a contact of all of them; a
-drift in fewer than seven recordings; an object that lies on most of a pad throughout them.
+drift in fewer than four recordings, or one that goes on in fewer than seven; an object that lies on
+most of a pad throughout them.
 """
 
 from __future__ import annotations
@@ -32,11 +33,12 @@ from scipy.ndimage import median_filter
 from diagnostics.model.middles import (
     AROUND,
     EVEN,
+    FEWEST_AROUND,
+    NEARLY_ALL,
     NOISES,
     agreed,
     around,
     even,
-    recordings_around,
     shortest,
     throughout,
 )
@@ -77,11 +79,13 @@ class Shared:
         drift: by how much each cell rests higher than it did in the reference, ``[n, D]``.
         offset: by how much it reads more than at rest without a load, ``[n, D]``.
         unseen: bool ``[D]``, cells of pads on which the reference never saw as much.
+        unknown: by how much more or less each cell may have drifted, ``[D]``.
     """
 
     drift: Array
     offset: Array
     unseen: Mask
+    unknown: Array
 
 
 @dataclass(frozen=True)
@@ -128,7 +132,7 @@ class Rest:
     def shared(self, record: Record, telling: Mask) -> Shared:
         """Return what the pads of a log share; ``telling``: bool ``[D]``, cells that are received
         and live."""
-        drift = self.drift(record, telling)
+        drift, unknown = self.drift(record, telling)
         above = record.mean - self.level - drift
         share = self.share
         of_pads = self.of_pads(record, telling, drift)
@@ -141,7 +145,7 @@ class Rest:
             of_pads = np.where(unseen, in_turn, of_pads)
             share = np.where(unseen, own, share)
         unseen |= (drift != 0).mean(axis=0) > _LASTS
-        return Shared(drift, drift + share * of_pads, unseen)
+        return Shared(drift, drift + share * of_pads, unseen, unknown)
 
     def of_pads(
         self,
@@ -174,9 +178,7 @@ class Rest:
             finest = max(self.least, min(noise, float(np.median(self.noise[tell]))))
             middle, weight, surely = even(of_pad, noise, finest)
             beside = around(middle, weight >= 1, record)
-            nowhere = np.isnan(beside)
-            if nowhere.any():
-                beside = np.where(nowhere, recordings_around(middle, weight >= 1, record), beside)
+            nowhere = beside == 0
             # no load is negative, nor as even: in a contact with most of a pad the lowest tell
             lowest = of_pad[:, : len(tell) // 2 + 1]
             if lowest.shape[1] > _FEWEST:
@@ -192,18 +194,19 @@ class Rest:
             found[:, cells] = shared[:, None]
         return found
 
-    def drift(self, record: Record, telling: Mask) -> Array:
+    def drift(self, record: Record, telling: Mask) -> tuple[Array, Array]:
         """Return by how much each cell rests higher than it did in the reference, where most of its
-        pad do, each by an amount of its own, ``[n, D]``.
+        pad do, each by an amount of its own, ``[n, D]``, and by how much that may err, ``[D]``.
 
         That is what the lowest readings of most of the recordings around agree on: a contact
         differs from recording to recording. Cells that contacts often do not leave alone in one
         tell nothing.
         """
         found = np.zeros(record.mean.shape, np.float32)
+        unknown = np.zeros(record.mean.shape[1], np.float32)
         first = _blocks(record)
-        if len(first) < AROUND:
-            return found
+        if len(first) < FEWEST_AROUND:
+            return found, unknown
         above = record.mean - self.level
         # what stays at an end of the converter is no rest
         at_end = (record.high <= 0) | (record.low >= self.full * (1 - DITHER))
@@ -226,10 +229,16 @@ class Rest:
             rests = shared + np.where(agree, own, 0)
             beyond = np.abs(rests) > np.maximum(near, _NOISIER * self.drifts[cells])
             displaced = (agree & beyond)[:, tell].mean(axis=1) > EVEN
+            few = len(first) < AROUND
+            if few and displaced.mean() < NEARLY_ALL:
+                continue  # a contact with most of a pad
             of_block[np.ix_(displaced, cells)] = rests[displaced]
+            if few:  # a cell that a contact hides in some may have drifted as the others did
+                err = np.where(agree, 0, NOISES * apart)[displaced]
+                unknown[cells] = err.max(axis=0, initial=0)
         pieces = np.diff(np.append(first, len(record)))
         found[:] = np.repeat(of_block, pieces, axis=0)
-        return found
+        return found, unknown
 
     def _stuck(self, record: Record, above: Array) -> Mask:
         """Return the cells that hold one value away from rest throughout, bool ``[D]``: where most
@@ -249,20 +258,21 @@ class Rest:
         return found
 
     def unsure(
-        self, record: Record, noise: Array, drift: Array, telling: Mask
+        self, record: Record, noise: Array, shared: Shared, telling: Mask
     ) -> tuple[Array, float]:
         """Return how far above or below rest a cell reads without a load in this log, ``[D]``, and
         the step of its converter: ``near``, or more where the pad is noisier than in the reference,
-        or the converter coarser.
+        its drift is unknown, or the converter is coarser.
 
         Args:
             record: of the log.
             noise: as :meth:`noise_of` returns it, ``[D]``.
-            drift: as :meth:`drift` returns it.
+            shared: as :meth:`shared` returns it.
             telling: bool ``[D]``, cells that are received and live.
         """
         step = _step(record, telling, 1e-5 * self.full)
-        moves = np.maximum(noise, _change(drift, record))
+        moves = np.maximum(noise, _change(shared.drift, record))
+        moves = np.maximum(moves, shared.unknown)
         found = np.where(moves > _NOISIER * self.noise, np.maximum(self.near, moves), self.near)
         if step <= max(NARROW * self.full, _NOISIER * self.step):
             step = 0.0
@@ -370,7 +380,7 @@ def fit_rest(record: Record, full: float, step: float, pad: Cells, living: Mask)
     noise = np.maximum(rest.noise_of(record, above, living), _change(shared.drift, record))
     at_top = rest.share_at_top(record, above, living)
     offsets = np.maximum(np.maximum(near, DITHER * full), _usually(rest.of_pads(record, living)))
-    drifts = _usually(replace(rest, drifts=none).drift(record, living))
+    drifts = _usually(replace(rest, drifts=none).drift(record, living)[0])
     low = np.nan_to_num(np.fmin.reduce(above))
     return replace(rest, low=low, noise=noise, offsets=offsets, drifts=drifts, at_top=at_top)
 

@@ -1,9 +1,5 @@
 """The paper's packets: what is written is read, and nothing else gets through."""
 
-import sys
-from pathlib import Path
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 
@@ -109,35 +105,3 @@ def test_the_longest_packet_is_longer_than_any_that_a_sender_writes():
 def test_a_name_that_could_not_be_read_back_is_not_sent():
     with pytest.raises(ValueError, match="device 'a,b'"):
         format_packet("a,b", 0, np.zeros(3))
-
-
-def test_the_micropython_sender_on_the_page_sends_such_packets(monkeypatch):
-    page = Path(__file__).parents[2] / "docs" / "robot-software.md"
-    code = page.read_text().partition("```py\n")[2].partition("```")[0]
-    counts = list(range(0, 4400, 20))
-    sent = []
-
-    class Sent(Exception):
-        pass
-
-    def sendto(data, address):
-        sent.append(data)
-        if len(sent) == 3:
-            raise Sent
-
-    wifi = SimpleNamespace(active=bool, connect=lambda *given: None, isconnected=lambda: True)
-    modules = {
-        "network": SimpleNamespace(WLAN=lambda interface: wifi, STA_IF=0),
-        "socket": SimpleNamespace(
-            socket=lambda *given: SimpleNamespace(sendto=sendto), AF_INET=0, SOCK_DGRAM=0
-        ),
-        "time": SimpleNamespace(ticks_ms=lambda: 4_321_987, sleep_ms=lambda duration: None),
-    }
-    for name, module in modules.items():
-        monkeypatch.setitem(sys.modules, name, module)
-    with pytest.raises(Sent):
-        exec(compile(code, page.name, "exec"), {"read_cells": lambda: counts})
-    packet = parse_packet(sent[0], 220)
-    assert (packet.device, packet.time) == ("hand", 4321.987)
-    np.testing.assert_array_equal(packet.values, counts)
-    assert len(sent) == 3

@@ -121,3 +121,14 @@ def test_untouched_cells_that_rest_a_little_elsewhere_are_neither_faulty_nor_tes
 def test_readings_of_a_converter_with_few_steps_may_be_any_load_of_a_step(fitted):
     log = [np.floor(frames / 1000) * 1000 for frames in presses(4, 30)]
     assert not fitted.diagnose(log).faults
+
+
+@pytest.mark.parametrize("seed", [3, 4, 5])
+def test_cells_that_rest_elsewhere_each_by_its_own_amount_are_healthy_in_a_short_log(fitted, seed):
+    apart = np.random.default_rng(seed).uniform(0, 80, 64)
+    log = [(frames + apart).round() for frames in presses(seed, 6)]
+    diagnosis = fitted.diagnose(log)
+    assert not diagnosis.faults
+    for frames in log:
+        frames[:, 27] = 1500.0
+    assert list(fitted.diagnose(log).fault_set) == [27]

@@ -1,14 +1,12 @@
 """How cells rest, and what a pad shares."""
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from diagnostics import SensorLayout
-from diagnostics.model.middles import recordings_around, shortest
+from diagnostics.model.middles import shortest
 from diagnostics.model.record import Record, record_of
 from diagnostics.model.rest import Rest, _step, fit_rest
 from diagnostics.preprocessing.tolerance import converter_step
@@ -37,7 +35,7 @@ def width_of_rest(rest: Rest, record: Record, living: np.ndarray) -> tuple[np.nd
     """How far a cell reads from rest without a load, ``[D]``, and the step of its converter."""
     shared = rest.shared(record, living)
     noise = rest.noise_of(record, rest.above(record, shared.offset), living)
-    return rest.unsure(record, noise, shared.drift, living)
+    return rest.unsure(record, noise, shared, living)
 
 
 @given(st.lists(st.floats(-1e3, 1e3), min_size=2, max_size=30))
@@ -250,14 +248,3 @@ def test_cells_that_rest_and_are_then_stuck_are_no_steps_of_a_coarse_converter()
     assert _step(record_of([readings], 8), every, 0.04) == 0
     coarse = 256 * np.floor(readings / 256)
     assert _step(record_of([coarse], 8), every, 0.04) == 256
-
-
-def test_a_recording_that_tells_no_offset_has_the_least_of_those_around():
-    recordings = np.repeat(np.arange(4), 3)
-    first = np.append(True, np.diff(recordings) > 0)
-    record = SimpleNamespace(first=first)
-    shared = np.array([4, 5, 6, 0, 0, 0, 0, 0, 0, -3, -2, -1], np.float32)
-    sure = recordings % 3 == 0
-    found = recordings_around(shared, sure, record)
-    assert found.reshape(4, 3)[:, 0].tolist() == [4, -1, -1, -1]
-    assert not recordings_around(shared, np.zeros(12, bool), record).any()

@@ -50,7 +50,7 @@ def concluded(
     probability, inferred = _with_causes(probability, causes)
     # Noise alone is no test; nor is movement, where the reference tells how cells depend on each
     # other; nor is a line that a shorted crossing pulls.
-    pulled = _pulled(judged, causes, inferred, order)
+    pulled = _pulled(judged, causes, inferred[order], place)
     causes = pulling(causes, pulled, layout)
     scale = stream.scale
     working = np.empty_like(inferred)
@@ -76,17 +76,24 @@ def concluded(
 
 
 def _pulled(
-    judged: Judged, causes: Sequence[Fault], inferred: Mask, order: NDArray[np.intp]
+    judged: Judged, causes: Sequence[Fault], inferred: Mask, place: NDArray[np.intp]
 ) -> Mask:
-    """Return the cells that shorted crossings pull, bool ``[D]``; ``inferred``: of the causes."""
+    """Return the cells that shorted crossings pull, bool ``[D]``.
+
+    Args:
+        judged: cells of the stream.
+        causes: on cells of the layout.
+        inferred: bool ``[D]``, cells of the stream that they explain.
+        place: int ``[D]``, cell of the stream that each cell of the layout is.
+    """
     shorts = [f.cells[0] for f in causes if f.kind is FaultKind.SHORT and f.line is None]
     if judged.pulled is None or not shorts:
         return np.zeros_like(inferred)
     # a cell that reads a part of its load may be pulled
     misleads = inferred.copy()
-    misleads[[c for f in causes if f.kind is FaultKind.WEAK for c in f.cells]] = False
-    place = np.argsort(order)
-    return judged.pulled(place[np.array(shorts)], misleads[order])[place]
+    weak = np.array([c for f in causes if f.kind is FaultKind.WEAK for c in f.cells], np.intp)
+    misleads[place[weak]] = False
+    return judged.pulled(place[np.array(shorts)], misleads)[place]
 
 
 def _unused(

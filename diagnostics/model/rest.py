@@ -271,8 +271,8 @@ class Rest:
             telling: bool ``[D]``, cells that are received and live.
         """
         step = _step(record, telling, 1e-5 * self.full)
-        moves = np.maximum(noise, _change(shared.drift, record))
-        moves = np.maximum(moves, shared.unknown)
+        drifts = np.maximum(shared.unknown, _change(shared.drift, record))
+        moves = np.maximum(noise, drifts)
         found = np.where(moves > _NOISIER * self.noise, np.maximum(self.near, moves), self.near)
         if step <= max(NARROW * self.full, _NOISIER * self.step):
             step = 0.0

@@ -460,12 +460,12 @@ def _centred_ranks(values: Floats) -> Floats:
 
 def chance_of(correlation: float, count: int) -> float:
     """Return how likely so high a rank correlation of so many independent pairs is."""
-    from scipy.special import stdtr  # a check of a data set rarely needs it, and waits for it
-
     if count == 0 or correlation <= -1:
         return 1.0
     if correlation >= 1:
         return 0.0
+    from scipy.special import stdtr  # a check of a data set rarely needs it, and waits for it
+
     freedom = count - 2
     against = correlation * np.sqrt(freedom / ((1 + correlation) * (1 - correlation)))
     return float(stdtr(freedom, -against))
